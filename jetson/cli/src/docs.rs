@@ -160,7 +160,7 @@ mod tests {
         }
         let error = find(site.path(), "plug").unwrap_err().to_string();
         assert!(error.contains("guides/plugin/"), "{error}");
-        let error = find(site.path(), "wether").unwrap_err().to_string();
+        let error = find(site.path(), "zebra").unwrap_err().to_string();
         assert!(error.contains("search"), "{error}");
     }
 

@@ -271,8 +271,8 @@ impl JetsonConfig {
         if let Some(key) = &mut config.vehicle.signing_key {
             *key = folder.join(&*key);
         }
-        for folder_of_plugin in &mut config.plugin.write {
-            *folder_of_plugin = folder.join(&*folder_of_plugin);
+        for path_of_plugin in config.plugin.write.iter_mut().chain(&mut config.plugin.read) {
+            *path_of_plugin = folder.join(&*path_of_plugin);
         }
         // A bare name may be a built-in plugin: keep it.
         if let Some(plugin) = &mut config.plugin.path

@@ -169,19 +169,22 @@ impl<'m> ObservationWriter<'m> {
         header.battery_v = battery.voltage_v.unwrap_or(0.0);
     }
 
-    /// Writes IMU samples, oldest first. Of more than 64, only the first 64 are written.
+    /// Writes IMU samples, oldest first. Of more than 64, the newest 64 are written.
     pub fn imu<'s>(&mut self, samples: impl IntoIterator<Item = &'s ImuSample>) {
         let header = self.header();
-        header.imu_count = 0;
-        for (record, sample) in header.imu.iter_mut().zip(samples) {
-            *record = ImuRecord {
+        let mut count = 0;
+        for sample in samples {
+            header.imu[count % MAX_IMU] = ImuRecord {
                 stamp_ns: sample.stamp.as_ns(),
                 accel_mps2: sample.accel_mps2.to_array().map(|value| value as f32),
                 gyro_radps: sample.gyro_radps.to_array().map(|value| value as f32),
             };
-            header.imu_count += 1;
+            count += 1;
         }
-        debug_assert!(header.imu_count as usize <= MAX_IMU);
+        if count > MAX_IMU {
+            header.imu.rotate_left(count % MAX_IMU);
+        }
+        header.imu_count = count.min(MAX_IMU) as _;
     }
 
     /// Returns the planes of camera `index`, of the size in its [`CameraInfo`], to decode into. `None` for an
@@ -302,7 +305,7 @@ impl ObservationBuffer {
         self.writer().battery(battery);
     }
 
-    /// Writes IMU samples, oldest first. Of more than 64, only the first 64 are written.
+    /// Writes IMU samples, oldest first. Of more than 64, the newest 64 are written.
     pub fn set_imu(&mut self, samples: &[ImuSample]) {
         self.writer().imu(samples);
     }
@@ -424,6 +427,10 @@ mod tests {
             buffer.observation().vehicle().is_none()
                 && buffer.observation().cameras().next().is_none()
         );
+
+        let many: Vec<_> = (1..=MAX_IMU as u64 + 9).map(imu).collect();
+        buffer.set_imu(&many);
+        assert_eq!(buffer.observation().imu().collect::<Vec<_>>(), many[9..]);
     }
 
     /// Withheld values are absent from the plugin's memory, not only hidden by the API.

@@ -224,6 +224,7 @@ impl PacketRouter {
 }
 
 fn status_text(severity: MavSeverity, text: &str) -> BridgeMessage {
+    debug_assert!(text.len() <= 50, "truncated: {text}");
     let data = STATUSTEXT_DATA { severity, text: text.into(), ..Default::default() };
     BridgeMessage::STATUSTEXT(data)
 }

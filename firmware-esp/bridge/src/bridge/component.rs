@@ -138,7 +138,7 @@ impl PacketRouter {
         let reason = if self.flight.armed {
             "bridge: nothing is changed while armed"
         } else if !self.is_signed_by_owner(packet) {
-            "bridge: changes need its key: vizflyt bridge configure"
+            "bridge: needs its key: vizflyt bridge configure"
         } else {
             return true;
         };

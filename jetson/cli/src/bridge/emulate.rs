@@ -416,7 +416,7 @@ fn boot_settings(store: &mut Store<FileFlash>, overrides: &[(String, String)]) -
     for (name, value) in overrides {
         if let Err(refused) = settings.set(name, value) {
             bail!(
-                "bridge: {name}={value} was rejected: {refused:?}; see `vizflyt bridge configure --list`"
+                "bridge: {name}={value} was rejected: {refused:?}; docs/guides/flash-bridge.md lists the settings"
             );
         }
     }

@@ -111,11 +111,13 @@ fn errors_name_the_file_and_paths_are_relative_to_it() {
     std::fs::write(&path, "[plugins]\n").unwrap();
     let error = JetsonConfig::read(&path).unwrap_err().to_string();
     assert!(error.contains("jetson.toml: line 1") && error.contains("'plugin'"), "{error}");
-    let text = "[server]\naddress = \"a:1\"\nkeys = \"keys\"\n[plugin]\npath = \"my/first\"\n";
+    let text = "[server]\naddress = \"a:1\"\nkeys = \"keys\"\n[plugin]\npath = \"my/first\"\nread = [\"map\"]\nwrite = [\"/w\"]\n";
     std::fs::write(&path, text).unwrap();
     let config = JetsonConfig::read(&path).unwrap();
     assert_eq!(config.server.unwrap().keys, Some(folder.path().join("keys")));
     assert_eq!(config.plugin.path, Some(folder.path().join("my/first")));
+    assert_eq!(config.plugin.read, [folder.path().join("map")]);
+    assert_eq!(config.plugin.write, [PathBuf::from("/w")]);
     std::fs::write(&path, "[plugin]\npath = \"avoid\"\n").unwrap();
     assert_eq!(JetsonConfig::read(&path).unwrap().plugin.path, Some("avoid".into()));
 }

@@ -90,8 +90,7 @@ fn of_collision(
         }
         Obstacle::Object(name) | Obstacle::Vehicle(name) => {
             return format!(
-                "it collided with '{name}', which moves, at {speed_mps:.1} m/s: the way was clear in the image, \
-                 but not on arrival"
+                "it collided with '{name}' at {speed_mps:.1} m/s: the way was clear in the image, but not on arrival"
             );
         }
         Obstacle::Unseen => {

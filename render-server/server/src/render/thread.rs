@@ -250,7 +250,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             std::mem::swap(image, &mut slot.image);
             slot.render_start = start;
             if result.is_ok() {
-                take_image(&mut self.imaging, newest, slot);
+                take_image(&mut self.imaging, rendering.seed, newest, slot);
             }
         }
         let end = clock::now();
@@ -282,7 +282,12 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
 }
 
 /// Applies the effects of the camera to a rendered image.
-fn take_image(effects: &mut [CameraEffects], newest: &NewestPoses, slot: &mut RenderedImage) {
+fn take_image(
+    effects: &mut [CameraEffects],
+    seed: u64,
+    newest: &NewestPoses,
+    slot: &mut RenderedImage,
+) {
     let RenderedImage { vehicle, camera, seq, .. } = *slot;
     let (Some(set), Some(newest), Some(world_from_body)) =
         (&slot.set, &newest[vehicle], slot.world_from_body)
@@ -293,7 +298,7 @@ fn take_image(effects: &mut [CameraEffects], newest: &NewestPoses, slot: &mut Re
     let v_world_mps = newest.motion.v_world_mps;
     let exposure = Exposure { at: slot.shown, world_from_body, v_world_mps };
     let camera = vehicle * MAX_CAMERAS + camera;
-    let seeds = [0, camera as u64, seq];
+    let seeds = [seed, camera as u64, seq];
     let input = EffectInput { config, info, motion: &newest.motion, exposure, seeds };
     effects[camera].apply(&input, &mut slot.image);
 }

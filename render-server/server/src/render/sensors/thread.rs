@@ -30,7 +30,7 @@ pub fn run<D: Demand + Sync>(inputs: Inputs<'_, D>, scene: &SensorScene, stop: &
     let Inputs { rendering, demand, .. } = inputs;
     let now = clock::now();
     let sensors = rendering.sensors.iter().enumerate();
-    let seed = |vehicle: usize| (vehicle as u64) << 32;
+    let seed = |vehicle: usize| rendering.seed.wrapping_add((vehicle as u64) << 32);
     let mut vehicles: Vec<_> = sensors
         .map(|(vehicle, sensors)| VehicleSensors::new(sensors.newest(), now, seed(vehicle)))
         .collect();
