@@ -1,9 +1,8 @@
-//! Two tables of `docs/BENCHMARKS.md`: what baked obstacles miss and make up by size of voxel, and
-//! our check beside the published one, in speed and error, on a scene whose geometry is known.
+//! Two tables of `docs/BENCHMARKS.md`: missed and false obstacles by voxel size, and speed and error of VizFlyt's check
+//! compared with the published one, on scenes with known geometry.
 //!
-//! The published check: 10 x 10 points on a sphere about the vehicle, the least distance from any
-//! of them to the centre of any splat, a collision when that is below a threshold; once an image.
-//! It is done here with a k-d tree over the centres, as the original does.
+//! The published check tests 10 x 10 points on a sphere around the vehicle, once per image. A collision is a distance
+//! below a threshold from any of them to the centre of any splat. As the original, it uses a k-d tree of the centres.
 //!
 //! `cargo bench -p vizflyt-scenes --bench collision`
 
@@ -94,7 +93,7 @@ fn compare(kind: &str, scene: &Generated) {
     }
 }
 
-/// 10 x 10 points by longitude and latitude.
+/// Returns 10 x 10 points by longitude and latitude.
 fn sphere(center: Vec3, radius: f32) -> impl Iterator<Item = Vec3> {
     (0..100).map(move |n| {
         let longitude = (n % 10) as f32 / 10.0 * std::f32::consts::TAU;
@@ -104,7 +103,7 @@ fn sphere(center: Vec3, radius: f32) -> impl Iterator<Item = Vec3> {
     })
 }
 
-/// A balanced k-d tree in place: the middle of a slice is its root, the axis is its depth's.
+/// Balanced k-d tree in place: the middle of a slice is its root, and the depth determines the axis.
 struct Tree(Vec<Vec3>);
 
 impl Tree {
@@ -122,8 +121,8 @@ impl Tree {
         Self(points)
     }
 
-    /// Whether a point lies within a distance: the question that the published check asks, with an
-    /// early end that the least distance itself would not have.
+    /// Whether a point lies within a distance. It gives the result of the published check, but ends earlier than a
+    /// search for the minimum distance.
     fn has_within(&self, at: Vec3, distance: f32) -> bool {
         fn search(points: &[Vec3], axis: usize, at: Vec3, distance: f32) -> bool {
             if points.is_empty() {

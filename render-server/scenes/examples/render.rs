@@ -1,10 +1,10 @@
-//! Renders a contact sheet of a generated scene: colour beside depth, from poses along the flight.
+//! Renders a contact sheet of a generated scene: colour and depth from poses along the flight.
 //!
 //! ```text
 //! cargo run --release -p vizflyt-scenes --example render -- forest 7 sheet.png
 //! cargo run --release -p vizflyt-scenes --example render -- race 3 sheet.png 2 5,0,1.2,90,-10
 //! ```
-//! After the file: how many times 320x240, then poses as `x,y,z,yaw_deg,pitch_deg`.
+//! Optional arguments after the file: scale of the size 320x240, then poses as `x,y,z,yaw_deg,pitch_deg`.
 
 use std::error::Error;
 use std::time::Instant;
@@ -73,7 +73,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Near is red, far is blue, nothing is black.
+/// Returns the colour of a depth: near is red, far is blue, no depth is black.
 fn depth_colour(depth_m: f32) -> [u8; 3] {
     if depth_m <= 0.0 {
         return [0; 3];

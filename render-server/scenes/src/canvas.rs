@@ -1,25 +1,24 @@
-//! Where scenes are painted: flat Gaussians laid on surfaces, in linear light, turned into the
-//! display colours that splats carry.
+//! Canvas for painting scenes: flat Gaussians on surfaces, in linear light, converted to the display colours of splats.
 
 use std::sync::OnceLock;
 
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_splat::Splats;
 
-/// One Gaussian patch of a surface.
+/// Gaussian patch of a surface.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Patch {
     /// Centre. [m, world]
     pub(crate) center_m: DVec3,
-    /// Direction away from the surface; need not be unit.
+    /// Direction away from the surface; any length.
     pub(crate) normal: DVec3,
     /// Direction of `sigma_m.x`; made perpendicular to the normal.
     pub(crate) along: DVec3,
-    /// Deviations along the patch, across it, and along the normal. [m]
+    /// Standard deviations along the patch, across it, and along the normal. [m]
     pub(crate) sigma_m: DVec3,
     /// Peak opacity.
     pub(crate) opacity: f64,
-    /// Linear light that leaves it, 1 being white paper in the sun.
+    /// Linear light that leaves the patch; 1: white paper in the sun.
     pub(crate) radiance: DVec3,
 }
 
@@ -30,7 +29,6 @@ pub(crate) struct Canvas {
 }
 
 impl Canvas {
-    /// Adds a patch.
     pub(crate) fn add(&mut self, patch: Patch) {
         let normal = patch.normal.normalize_or(DVec3::Z);
         let flat = patch.along - normal * patch.along.dot(normal);
@@ -45,7 +43,7 @@ impl Canvas {
         self.splats.sh.extend(((display - 0.5) / SH_CONSTANT).as_vec3().to_array());
     }
 
-    /// Returns how many patches there are.
+    /// Returns the number of patches.
     pub(crate) fn len(&self) -> usize {
         self.splats.len()
     }
@@ -56,9 +54,9 @@ impl Canvas {
     }
 }
 
-/// Returns linear light of a display colour written as in a paint program, `0xRRGGBB`.
+/// Returns the linear light of a display colour `0xRRGGBB`.
 pub(crate) fn paint(rgb: u32) -> DVec3 {
-    // Textures ask a million times: a table of the inverse sRGB transfer.
+    // Textures call this a million times, so the inverse sRGB transfer is a table.
     static LINEAR: OnceLock<[f64; 256]> = OnceLock::new();
     let linear = LINEAR.get_or_init(|| {
         core::array::from_fn(|n| {
@@ -70,8 +68,8 @@ pub(crate) fn paint(rgb: u32) -> DVec3 {
     DVec3::new(channel(16), channel(8), channel(0))
 }
 
-/// Returns the display colour (sRGB, 0 to 1) of linear light: a filmic shoulder, so that sunlit
-/// surfaces keep their hue, then the sRGB transfer (IEC 61966-2-1).
+/// Returns the display colour (sRGB, 0 to 1) of linear light: a filmic shoulder, so that sunlit surfaces keep their
+/// hue, then the sRGB transfer (IEC 61966-2-1).
 fn display_from_linear(radiance: DVec3) -> DVec3 {
     let channel = |light: f64| {
         let x = light.max(0.0);
@@ -82,7 +80,7 @@ fn display_from_linear(radiance: DVec3) -> DVec3 {
     DVec3::new(channel(radiance.x), channel(radiance.y), channel(radiance.z))
 }
 
-/// The constant harmonic, 1 / (2 sqrt(pi)).
+/// Constant spherical harmonic, 1 / (2 sqrt(pi)).
 const SH_CONSTANT: f64 = 0.282_094_791_773_878_14;
 
 #[cfg(test)]
@@ -90,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn paint_shows_as_painted_below_the_shoulder() {
+    fn colours_below_the_shoulder_survive_a_round_trip() {
         for rgb in [0x000000, 0x204060, 0x7f7f7f, 0xb0a090] {
             let shown = display_from_linear(paint(rgb)) * 255.0;
             let back = DVec3::new(

@@ -1,4 +1,4 @@
-//! Light and weather drawn at random, within bounds: so that a plugin is graded by conditions that nobody prepared for.
+//! Random light and weather within bounds, so that a plugin is graded in conditions for which it was not tuned.
 
 use core::ops::RangeInclusive;
 
@@ -11,14 +11,14 @@ use vizflyt_arena::config::{
 
 use crate::random::Rng;
 
-/// `[environments]` of a project's file: within what its environments are drawn. Each pair is the least and the greatest;
-/// all may be left out.
+/// `[environments]` of a project file: bounds of random environments. Each pair is minimum and maximum; all keys are
+/// optional.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DrawBounds {
-    /// The weathers that are drawn from, each as often.
+    /// Kinds of weather, with equal probability.
     pub weathers: Vec<Weather>,
-    /// Factor of the capture's display values, of all colours together.
+    /// Factor on the display values of the scene, for all colours.
     pub light: [f64; 2],
     /// Visibility of fog, smoke and dust. [m]
     pub visibility_m: [f64; 2],
@@ -28,19 +28,19 @@ pub struct DrawBounds {
     pub snow_mmph: [f64; 2],
     /// Wind, from any side. [m/s]
     pub wind_mps: [f64; 2],
-    /// Glare of a low sun, which every fourth environment has that is no dark one.
+    /// Glare of a low sun, in a quarter of the environments that are not dark.
     pub glare: [f64; 2],
-    /// Depth of the flicker, which every fourth environment has.
+    /// Depth of the flicker, in a quarter of the environments.
     pub flicker: [f64; 2],
 }
 
-/// What is drawn besides light.
+/// Kind of weather.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Weather {
     /// Clear air.
     Clear,
-    /// The same fog everywhere.
+    /// Uniform fog.
     Fog,
     /// Fog in patches.
     PatchyFog,
@@ -54,9 +54,9 @@ pub enum Weather {
     Snow,
 }
 
-/// Keeps environments apart from places of the same seed.
+/// Makes environments independent of places with the same seed.
 const SALT: u64 = 0xe17_0000;
-/// Darker than this, lamps shine, the vehicle's or the hall's. [factor of display values]
+/// Below this light, lamps of the vehicle or the hall are on. [factor of display values]
 const DARK: f64 = 0.4;
 
 impl Default for DrawBounds {
@@ -76,7 +76,7 @@ impl Default for DrawBounds {
 }
 
 impl DrawBounds {
-    /// Checks them: whatever is drawn within them is valid.
+    /// Checks that all environments within the bounds are valid.
     ///
     /// # Errors
     /// [`ConfigError::Invalid`], which names the key.
@@ -94,23 +94,22 @@ impl DrawBounds {
             check_number(key, least, unit, range.clone())?;
             check_number(key, greatest, unit, range)?;
             if least > greatest {
-                let advice = "give the least first, then the greatest";
+                let advice = "give the minimum first, then the maximum";
                 return Err(invalid(key, format!("[{least}, {greatest}]"), advice));
             }
         }
         if self.weathers.is_empty() {
-            return Err(invalid("environments.weathers", "[]", "give one weather at least"));
+            return Err(invalid("environments.weathers", "[]", "give at least one weather"));
         }
         Ok(())
     }
 
-    /// Returns the environment of a number among those of a seed. Its numbers have three decimals, so that they are the
-    /// same ones after any text.
+    /// Returns environment `number` of a seed. Its values have three decimals, so that a conversion to text keeps them.
     pub fn draw(&self, seed: u64, number: u64) -> EnvironmentConfig {
         let mut rng = Rng::new(seed ^ SALT, number);
         let mut within = |[least, greatest]: [f64; 2]| thousandth(rng.range(least, greatest));
         let level = within(self.light);
-        // Warmer or colder by up to a tenth.
+        // Warmer or colder by up to 10 %.
         let warmth = within([-0.1, 0.1]);
         let light = [level * (1.0 + warmth), level, level * (1.0 - warmth)]
             .map(|x| thousandth(x.clamp(0.02, 4.0)));
@@ -127,7 +126,7 @@ impl DrawBounds {
         let [has_sun, flickers, own_light] = [(); 3].map(|()| within([0.0, 1.0]));
         let which = within([0.0, 1.0]) * self.weathers.len() as f64;
         let weather = self.weathers[(which as usize).min(self.weathers.len() - 1)];
-        // Air is as bright as the light in it.
+        // The light also applies to fog, smoke and dust.
         let lit =
             |color: [f64; 3]| [0, 1, 2].map(|c| thousandth((color[c] * light[c]).clamp(0.0, 1.0)));
         let fog = lit(EnvironmentConfig::CLEAR.fog);
@@ -186,7 +185,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_drawn_is_valid_within_bounds_and_the_same_again() {
+    fn draws_valid_reproducible_environments_within_bounds() {
         let bounds = DrawBounds::default();
         bounds.check().unwrap();
         let mut seen = HashSet::new();
@@ -210,7 +209,7 @@ mod tests {
             if let Some(rain) = drawn.rain {
                 assert!((2.0..=80.0).contains(&rain.rate_mmph) && rain.wind_mps.length() < 4.01);
             }
-            // Numbers come back from their text.
+            // Values survive a conversion to text.
             let text = toml::to_string(&drawn).unwrap();
             assert_eq!(toml::from_str::<EnvironmentConfig>(&text).unwrap(), drawn);
         }
@@ -218,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn bounds_hold_and_wrong_ones_are_named() {
+    fn respects_bounds_and_names_invalid_ones() {
         let narrow: DrawBounds =
             toml::from_str("weathers = [\"rain\"]\nlight = [1, 1]\nrain_mmph = [5, 6]").unwrap();
         narrow.check().unwrap();

@@ -1,17 +1,18 @@
-//! What a phone makes of a rendered place: a lens, an exposure that rolls over the rows while the phone moves, an automatic
-//! exposure, and noise. Sans-IO and without a renderer: cameras out, rendered images in, pixels out.
+//! Model of a phone camera: lens, rolling shutter while the phone moves, automatic exposure, and noise. Without I/O and
+//! renderer: it returns cameras, takes rendered images, and returns pixels.
 //!
-//! Data flow per image, of which [`phone`] has the figures:
+//! Data flow per image; [`phone`] has the parameters:
 //! ```text
-//! Film::cameras     one camera per band of rows, where the phone is when the band's middle row is exposed
+//! Film::camera      camera of each band of rows, with the phone's pose when the band's middle row is exposed
 //!   -> a renderer   colour and depth of each band, with a margin
-//! Film::take        display colours -> linear light (the caller may lay ink onto it)
-//! Meter::next       the light -> gain, shutter, ISO: the automatic exposure, which lags as a phone's does
-//! Film::develop     every row from its own instants: each pixel's path through the band while the row is exposed, by
-//!                   depth and by the exact poses; then vignette, gain, noise, tone curve -> 8 bits
+//! Film::take        display colours -> linear light (the caller may draw tags onto it)
+//! Meter::next       light -> gain, shutter, ISO: automatic exposure with the lag of a phone
+//! Film::develop     each row at its exposure times: path of each pixel through the band during the exposure, from
+//!                   depth and exact poses; then vignette, gain, noise, tone curve -> 8 bits
 //! ```
-//! A row is at most half a band's time and half an exposure from where its band was rendered, some 8 ms or 4 px: what opens behind
-//! edges in that time is filled from beside it. `film/tests.rs` holds this against every row rendered at each of its instants.
+//! A row is at most half a band's time plus half an exposure away from the time of its band's rendering, about 8 ms or
+//! 4 px. Areas that become visible behind edges in this time are filled from their neighbourhood. `film/tests.rs`
+//! compares the result with a rendering of each row at each of its exposure times.
 
 mod develop;
 mod meter;
@@ -28,10 +29,10 @@ use vizflyt_splat::{Camera, RgbdImage};
 pub use meter::{Exposure, Meter};
 pub use phone::Phone;
 
-/// Where the phone is at an instant. [s]
+/// Pose of the phone at a time. [s]
 pub type Track<'a> = dyn Fn(f64) -> Pose<World, Cam> + Sync + 'a;
 
-/// Films with one phone.
+/// Camera model of a phone.
 #[derive(Debug)]
 pub struct Film {
     phone: Phone,
@@ -41,25 +42,25 @@ pub struct Film {
     noise: develop::Noise,
 }
 
-/// Rows that are rendered together.
+/// Band of rows that are rendered together.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Band {
-    /// Rows of the image.
+    /// Rows in the image.
     pub rows: Range<u32>,
-    /// The same lens, onto these rows and a margin on every side.
+    /// Intrinsics for these rows plus a margin on each side.
     pub intrinsics: Intrinsics,
-    /// Width of the margin. [px]
+    /// Margin. [px]
     pub margin_px: u32,
 }
 
-/// What a band saw, in linear light.
+/// Rendered band in linear light.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BandImage {
-    /// Where it was seen from.
+    /// Pose of the rendering.
     pub world_from_cam: Pose<World, Cam>,
-    /// Linear light, H x W x 3 of the band's own size; 1 is the brightest that the scene's file shows.
+    /// Linear light, H x W x 3 of the band's size; 1: the brightest value of the scene file.
     pub light: Vec<f32>,
-    /// Median camera-z depth, H x W; 0 where nothing is. [m, cam]
+    /// Median depth along the optical axis, H x W; 0: none. [m, cam]
     pub depth_m: Vec<f32>,
 }
 
@@ -70,25 +71,24 @@ impl Default for BandImage {
 }
 
 impl Film {
-    /// Prepares for a phone.
+    /// Prepares the model of a phone.
     pub fn new(phone: Phone) -> Self {
         let bands = bands(&phone);
         let pixels = pixels(&phone.intrinsics);
         Self { phone, bands, pixels, tone: Tone::default(), noise: develop::Noise::new() }
     }
 
-    /// Returns the phone.
     pub fn phone(&self) -> &Phone {
         &self.phone
     }
 
-    /// Returns the bands, from the top.
+    /// Returns the bands, from top to bottom.
     pub fn bands(&self) -> &[Band] {
         &self.bands
     }
 
-    /// Returns when a band is to be rendered: at the middle of its middle rows' exposure, for an image whose middle row's is
-    /// at `middle_s`. [s]
+    /// Returns the time of a band's rendering: the middle of the exposure of the band's middle row. `middle_s` is the
+    /// middle of the exposure of the image's middle row. [s]
     pub fn instant_s(&self, band: &Band, middle_s: f64) -> f64 {
         let row = f64::midpoint(f64::from(band.rows.start), f64::from(band.rows.end));
         self.phone.row_instant_s(row, middle_s)
@@ -99,7 +99,7 @@ impl Film {
         Camera::new(band.intrinsics, track(self.instant_s(band, middle_s)), NEAR_M)
     }
 
-    /// Takes what was rendered for a band's camera.
+    /// Converts the rendered image of a band's camera to linear light.
     pub fn take(&self, camera: &Camera, image: &RgbdImage, into: &mut BandImage) {
         into.world_from_cam = camera.world_from_cam;
         into.light.clear();
@@ -108,7 +108,7 @@ impl Film {
     }
 }
 
-/// Cuts the image into bands that are exposed within [`BAND_S`] each.
+/// Divides the image into bands, each of which is exposed within [`BAND_S`].
 fn bands(phone: &Phone) -> Vec<Band> {
     let k = &phone.intrinsics;
     let count = (phone.readout_s / BAND_S).ceil().clamp(1.0, 16.0) as u32;
@@ -130,17 +130,17 @@ fn bands(phone: &Phone) -> Vec<Band> {
 }
 
 impl Band {
-    /// Returns where the image's upper left corner is in the band's. [px]
+    /// Returns the position of the image's upper left corner in the band. [px]
     fn origin_px(&self) -> DVec2 {
         let margin = f64::from(self.margin_px);
         DVec2::new(margin, margin - f64::from(self.rows.start))
     }
 }
 
-/// Longest time over which a band's rows are exposed: a hand's turn of 60 degrees a second moves what it sees by 2 px from the
-/// band's middle to its border. [s]
+/// Maximum readout time of a band: a rotation of 60 degrees per second moves the image by 2 px between the middle and
+/// the border of the band. [s]
 const BAND_S: f64 = 0.006;
-/// Nothing is nearer to a walker's phone. [m]
+/// Near limit: nothing is nearer to a walker's phone. [m]
 const NEAR_M: f32 = 0.05;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What can be generated, and what comes of it.
+//! Kinds of generated scenes, and their result.
 
 use core::fmt;
 use core::str::FromStr;
@@ -9,7 +9,7 @@ use vizflyt_splat::{RigidObject, Splats};
 
 use crate::parts::ScenePart;
 
-/// What can be generated.
+/// Kind of a generated scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum SceneKind {
     /// 40 m of trees between start and goal.
@@ -23,15 +23,15 @@ pub enum SceneKind {
 }
 
 impl SceneKind {
-    /// Every kind.
+    /// All kinds.
     pub const ALL: [Self; 4] = [Self::Forest, Self::Race, Self::Room, Self::Moving];
 
-    /// Returns the names of all, as help and messages list them.
+    /// Returns the names of all kinds, for help and messages.
     pub fn names() -> String {
         Self::ALL.map(Self::name).join(", ")
     }
 
-    /// Returns the kind's name as the command line takes it.
+    /// Returns the name of the kind on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Forest => "forest",
@@ -59,26 +59,26 @@ impl FromStr for SceneKind {
     }
 }
 
-/// A name that is no [`SceneKind`].
+/// Unknown name of a [`SceneKind`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("no generated scene is called '{0}'; there are {all}", all = SceneKind::names())]
 pub struct UnknownScene(pub String);
 
-/// A generated place.
+/// Generated place.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Generated {
-    /// What cameras see, SH degree 0. [m, world]
+    /// Static splats, SH degree 0. [m, world]
     pub splats: Splats,
-    /// Which of the splats are of which thing; in the order of their splats, which no two share.
+    /// Ranges of splats for each thing, in order, without overlaps.
     pub parts: Vec<ScenePart>,
-    /// The room and its rules; names the scene file that [`Self::write`] makes.
+    /// Room and rules; refers to the scene file that [`Self::write`] writes.
     pub arena: ArenaConfig,
-    /// The true obstacles, and the floor as a half space; not the fence. [m, world]
+    /// True obstacles, and the floor as a half space, without the fence. [m, world]
     pub truth: Vec<Volume>,
-    /// What moves, in the order of `arena.objects`. [m, object]
+    /// Moving objects, in the order of `arena.objects`. [m, object]
     pub objects: Vec<RigidObject>,
-    /// The true solids of each object. [m, object]
+    /// True solids of each moving object. [m, object]
     pub true_objects: Vec<Vec<Volume>>,
-    /// Whether plugins may read the map: then [`Self::write`] stores `map.json` too.
+    /// Whether plugins may read the map. In this case, [`Self::write`] also stores `map.json`.
     pub map_is_known: bool,
 }

@@ -1,15 +1,15 @@
 //! Generated twins with exactly known geometry: a forest, a race, and the netted room.
 //!
-//! [`generate`] plans a place from a seed as true solids ([`Volume`]), then lays flat Gaussians on
-//! their surfaces with textures and baked light, so that pictures, rendered depth and truth agree
-//! within centimetres. [`Generated::write`] stores `scene.ply`, `arena.toml` and `truth.json`. The
-//! same seed gives the same bytes on every machine: all randomness is hashed integers, all
-//! functions come from `libm`, and nothing depends on the order of threads.
+//! [`generate`] plans a place from a seed as true solids ([`Volume`]). It then covers their surfaces with flat
+//! Gaussians with textures and baked light, so that images, rendered depth and truth agree within centimetres.
+//! [`Generated::write`] stores `scene.ply`, `arena.toml` and `truth.json`. The same seed gives the same bytes on every
+//! machine: random numbers are hashed integers, all functions come from `libm`, and no result depends on the order of
+//! threads.
 //!
-//! [`film_set`] also plans a [`walk`] through it, with boards for printed tags along it, and [`film`] makes of rendered
-//! images what a phone would have filmed on this walk.
+//! [`film_set`] also plans a [`walk`] through the scene, with boards for printed tags along it. [`film`] converts
+//! rendered images into the video that a phone would record on this walk.
 //!
-//! Called once per scene by the command line; takes well under two seconds.
+//! The command line calls it once per scene; it takes less than two seconds.
 
 mod canvas;
 mod draw;
@@ -42,7 +42,7 @@ pub use write::{WriteError, Written};
 /// use vizflyt_scenes::{SceneKind, generate};
 /// let forest = generate(SceneKind::Forest, 7);
 /// assert!((50_000..150_000).contains(&forest.splats.len()));
-/// // Nothing solid within 2 m of the place of take-off, but for the floor.
+/// // Within 2 m of the takeoff, only the floor is solid.
 /// let start_m = forest.arena.spawn.position_m + glam::DVec3::Z * forest.arena.takeoff_height_m;
 /// let clearance_m =
 ///     forest.truth.iter().map(|v| v.signed_distance_m(start_m)).fold(f64::MAX, f64::min);

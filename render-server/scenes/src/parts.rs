@@ -1,48 +1,47 @@
-//! What a generated scene is made of: which splats are of which gate, wall or tree.
+//! Parts of a generated scene: the splats of each gate, wall or tree.
 //!
-//! Painters fill a canvas one thing after the other, so that a thing is a range of splats: exact, where boxes around
-//! things would have to guess. Masks of `vizflyt dataset` are made from them.
+//! Things are painted one after the other, so that each is an exact range of splats; boxes around things would only be
+//! approximate. `vizflyt dataset` derives its masks from them.
 
 use core::ops::Range;
 
 use crate::canvas::Canvas;
 
-/// One thing that stands still, or one kind of ground.
+/// Static thing, or kind of ground.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ScenePart {
-    /// `window 1`; of a gate the name of its stage.
+    /// Name, such as `window 1`; for a gate, that of its stage.
     pub name: String,
-    /// What it is.
     pub class: PartClass,
-    /// Its splats, by their place in [`Generated::splats`](crate::Generated::splats).
+    /// Range of its splats in [`Generated::splats`](crate::Generated::splats).
     pub splats: Range<usize>,
 }
 
-/// What a part is.
+/// Class of a part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum PartClass {
-    /// The frame of a racing window, without its stand.
+    /// Frame of a racing window, without its stand.
     Gate,
-    /// Legs and feet of a gate, and the motor of a hand.
+    /// Legs and feet of a gate, or the motor of a clock hand.
     Stand,
-    /// A wall that is flown through or around.
+    /// Wall to fly through or around.
     Wall,
     /// A pillar.
     Pillar,
     /// Shell and furniture of the hall.
     Room,
-    /// The ground of the forest.
+    /// Ground of the forest.
     Ground,
     /// Trunks, branches and logs.
     Tree,
     /// Leaves, ferns and grass.
     Plant,
-    /// What is far away.
+    /// Distant surroundings.
     Backdrop,
 }
 
 impl PartClass {
-    /// Returns its name: `gate`.
+    /// Returns the name of the class, such as `gate`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Gate => "gate",
@@ -58,7 +57,7 @@ impl PartClass {
     }
 }
 
-/// Notes what painters add to a canvas.
+/// Recorder of parts while a canvas is painted.
 #[derive(Debug, Default)]
 pub(crate) struct Parts {
     parts: Vec<ScenePart>,
@@ -66,7 +65,7 @@ pub(crate) struct Parts {
 }
 
 impl Parts {
-    /// Takes what was painted since the last call for a part; nothing painted is no part.
+    /// Adds a part with all splats painted since the last call; adds nothing if there are none.
     pub(crate) fn add(&mut self, canvas: &Canvas, class: PartClass, name: &str) {
         let splats = self.painted..canvas.len();
         self.painted = splats.end;
@@ -75,7 +74,6 @@ impl Parts {
         }
     }
 
-    /// Returns them.
     pub(crate) fn finish(self) -> Vec<ScenePart> {
         self.parts
     }

@@ -1,9 +1,9 @@
-//! Boards for printed sheets, put up where a walk sees them: on walls, and on posts beside the way.
+//! Boards for printed sheets at positions that a walk sees: on walls, and on posts next to the path.
 //!
-//! Data flow: [`plan`] tries many places, leaves out those that touch something or that something hides, and takes the ones
-//! that most of the walk sees; each is a true solid like all else. [`paint`] covers boards and posts with patches, lit as
-//! the place is. What is printed on them is no concern of this crate: a splat is too soft for the edge of a tag, so the ink is
-//! laid onto images (`vizflyt scene generate --tags`).
+//! Data flow: [`plan`] tests many positions, rejects those that touch something or are hidden, and selects the ones
+//! that most of the walk sees. Each board is a true solid. [`paint`] covers boards and posts with patches in the light
+//! of the place. Sheets are white in the scene: a splat is too soft for the edge of a tag, so tags are drawn onto
+//! images (`vizflyt scene generate --tags`).
 
 mod sight;
 
@@ -16,30 +16,30 @@ use crate::solids::Solids;
 use crate::walk::Walk;
 use sight::Glimpse;
 
-/// The front of a board: a white sheet.
+/// White sheet on the front of a board.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Print {
-    /// Where its middle is; x is to the reader's right, y up, z towards the reader.
+    /// Pose of its centre: x to the reader's right, y up, z towards the reader.
     pub world_from_print: Pose<World, Object>,
     /// Edge of the square sheet. [m]
     pub side_m: f64,
 }
 
-/// A board, upright or leaning back a little, on a wall or on a post.
+/// Board on a wall or on a post, upright or leaning back a little.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Board {
     front: Print,
-    /// Height of the post's foot, if it stands on one. [m, world]
+    /// Whether the board stands on a post.
     stands: bool,
 }
 
 impl Board {
-    /// Returns its sheet.
+    /// Returns the sheet of the board.
     pub(crate) fn print(&self) -> Print {
         self.front
     }
 
-    /// Returns its solids.
+    /// Returns the solids of board and post.
     pub(crate) fn volumes(&self) -> Vec<Volume> {
         let pose = self.front.world_from_print;
         let half_m = DVec3::new(self.front.side_m / 2.0, self.front.side_m / 2.0, THICK_M / 2.0);
@@ -51,7 +51,7 @@ impl Board {
         volumes
     }
 
-    /// Returns the corners of its post, which ends behind the board's middle.
+    /// Returns the corners of the post, which ends behind the board's centre.
     fn post(&self) -> Option<(DVec3, DVec3)> {
         self.stands.then(|| {
             let top_m = self
@@ -72,19 +72,19 @@ impl Board {
     }
 }
 
-/// Where boards may be put up.
+/// Allowed positions of boards.
 pub(crate) struct Places<'a> {
-    /// What stands there.
+    /// Solids of the scene.
     pub(crate) solids: &'a Solids,
-    /// Walls, as a point on each and its inward normal, and how long they are to both sides of it. [m, world]
+    /// Walls: a point on the wall, the inward normal, and the extent to both sides of the point. [m, world]
     pub(crate) walls: &'a [(DVec3, DVec3, f64)],
-    /// The floor on which posts may stand. [m, world]
+    /// Floor on which posts may stand. [m, world]
     pub(crate) floor_m: [DVec2; 2],
-    /// Where none may stand: a course is flown here. [m, world]
+    /// Area without posts, because a course is flown there. [m, world]
     pub(crate) kept_free: Option<[DVec2; 2]>,
 }
 
-/// Returns up to [`COUNT`] boards for a walk; the same input gives the same boards.
+/// Returns up to [`COUNT`] boards for a walk. The same input gives the same boards.
 pub(crate) fn plan(places: &Places<'_>, walk: &Walk, seed: u64) -> Vec<Board> {
     let glimpses = sight::glimpses(walk);
     let way_m = sight::way_m(walk);
@@ -97,7 +97,7 @@ pub(crate) fn plan(places: &Places<'_>, walk: &Walk, seed: u64) -> Vec<Board> {
             (!seen.is_empty()).then_some((board, seen))
         })
         .collect();
-    // How many chosen boards each glimpse sees: a further one counts less.
+    // Number of chosen boards that each glimpse sees: further boards count less.
     let mut counts = vec![0u32; glimpses.len()];
     let mut chosen: Vec<Board> = Vec::new();
     while chosen.len() < COUNT {
@@ -117,7 +117,7 @@ pub(crate) fn plan(places: &Places<'_>, walk: &Walk, seed: u64) -> Vec<Board> {
         for n in seen {
             counts[n] += 1;
         }
-        // A board must not hide another, nor lean on it.
+        // A board must not hide or touch another one.
         let middle_m = board.front.world_from_print.translation_m;
         open.retain(|(other, _)| {
             (other.front.world_from_print.translation_m - middle_m).length() > APART_M
@@ -127,7 +127,7 @@ pub(crate) fn plan(places: &Places<'_>, walk: &Walk, seed: u64) -> Vec<Board> {
     chosen
 }
 
-/// Returns boards on walls and on posts, before anything is asked of them.
+/// Returns candidate boards on walls and on posts, without any checks.
 fn candidates(places: &Places<'_>, way_m: &[DVec2], rng: &mut Rng) -> Vec<Board> {
     let mut boards = Vec::new();
     for &(middle_m, normal, reach_m) in places.walls {
@@ -146,7 +146,7 @@ fn candidates(places: &Places<'_>, way_m: &[DVec2], rng: &mut Rng) -> Vec<Board>
         let is_kept_free = places
             .kept_free
             .is_some_and(|[low, high]| at.cmpgt(low - 0.3).all() && at.cmplt(high + 0.3).all());
-        // It faces a place of the way that is near, and not the nearest: then it is seen for longer.
+        // It faces a near position of the path, but not the nearest one, so that it is seen for longer.
         let near: Vec<DVec2> =
             way_m.iter().copied().filter(|p| ((*p - at).length() - 2.2).abs() < 0.8).collect();
         let (z, turn, lean) = (rng.range(0.95, 1.35), rng.spread(0.25), rng.range(0.0, 0.15));
@@ -161,7 +161,7 @@ fn candidates(places: &Places<'_>, way_m: &[DVec2], rng: &mut Rng) -> Vec<Board>
     boards
 }
 
-/// Whether a board touches nothing and is in nobody's way.
+/// Whether a board touches nothing and does not obstruct the path.
 fn fits(board: &Board, solids: &Solids, way_m: &[DVec2]) -> bool {
     let pose = board.front.world_from_print;
     let least_m = if board.stands { 0.12 } else { 0.5 * THICK_M };
@@ -169,7 +169,7 @@ fn fits(board: &Board, solids: &Solids, way_m: &[DVec2]) -> bool {
     for row in -2..=2 {
         for column in -2..=2 {
             let at = DVec2::new(f64::from(column), f64::from(row)) * (half / 2.0);
-            // Something may stand close behind a wall's board, nothing close before it.
+            // Objects may be close behind a board on a wall, but not in front of it.
             for z in [0.0, 0.15, 0.3] {
                 if solids.distance_m(pose.transform_point(at.extend(z))) < least_m.max(0.6 * z) {
                     return false;
@@ -190,12 +190,12 @@ fn fits(board: &Board, solids: &Solids, way_m: &[DVec2]) -> bool {
     way_m.iter().all(|p| (*p - at).length() > if board.stands { 0.85 } else { 0.6 })
 }
 
-/// Returns the glimpses of a walk that see a board well: near, from ahead, with nothing between.
+/// Returns the indices of the glimpses that see a board well: near, from the front, and unobstructed.
 fn seen(board: &Board, solids: &Solids, glimpses: &[Glimpse]) -> Vec<usize> {
     (0..glimpses.len()).filter(|&n| glimpses[n].sees(&board.front, solids)).collect()
 }
 
-/// Paints boards; `matt(point, normal, albedo)` is the light that leaves a matt surface.
+/// Paints boards. `matt(point, normal, albedo)` returns the light that leaves a matt surface.
 pub(crate) fn paint(
     canvas: &mut Canvas,
     boards: &[Board],
@@ -213,7 +213,7 @@ pub(crate) fn paint(
         face(canvas, [corner(0.0), right, up], side, white, matt);
         let low_right = pose.transform_point(DVec3::new(half, -half, -THICK_M));
         face(canvas, [low_right, -right, up], side, back, matt);
-        // Edges: thin, and seen from aside only.
+        // Edges, which are only visible from the side.
         let thin = DVec2::new(THICK_M, board.front.side_m);
         face(canvas, [corner(-THICK_M), normal, up], thin, white * 0.8, matt);
         let right_edge = pose.transform_point(DVec3::new(half, -half, 0.0));
@@ -238,8 +238,8 @@ pub(crate) fn paint(
     }
 }
 
-/// Paints a rectangle from its corner, to the right and up; its outside is `right x up`. Two layers, half a cell
-/// apart, so that no seam shows.
+/// Paints a rectangle from its corner to the right and up, with the normal `right x up`. It has two layers, half a cell
+/// apart, so that no seams are visible.
 fn face(
     canvas: &mut Canvas,
     [corner_m, right, up]: [DVec3; 3],
@@ -252,7 +252,7 @@ fn face(
         let counts = (size_m / CELL_M).ceil().max(DVec2::ONE)
             + if size_m.min_element() > CELL_M { layer * 2.0 } else { 0.0 };
         let cell_m = size_m / counts;
-        // So that patches end where the board does: two deviations inside it, for the outermost.
+        // Patches are centred in their cells, so that the outermost ones end near the edge of the board.
         for row in 0..counts.y as usize {
             for column in 0..counts.x as usize {
                 let middle = (DVec2::new(column as f64, row as f64) + 0.5) * cell_m;
@@ -270,22 +270,22 @@ fn face(
     }
 }
 
-/// Most boards of a scene.
+/// Maximum number of boards of a scene.
 pub(crate) const COUNT: usize = 14;
-/// Edge of a board: a tag of 0.24 m with its white rim, and a hand's breadth. [m]
+/// Edge of a board: a tag of 0.24 m, its white rim, and about 0.1 m. [m]
 const SIDE_M: f64 = 0.38;
 const THICK_M: f64 = 0.03;
 /// Width of a post. [m]
 const POST_M: f64 = 0.04;
-/// The front of a board on a wall: its thickness and a gap before the wall. [m]
+/// Distance of the front of a board from its wall: thickness plus a gap. [m]
 const OFF_WALL_M: f64 = THICK_M + 0.015;
-/// Middles of boards are at least this far apart. [m]
+/// Minimum distance between the centres of boards. [m]
 const APART_M: f64 = 1.1;
-/// Places on the floor that are tried.
+/// Number of tested positions on the floor.
 const STANDING_TRIES: usize = 1500;
-/// A board that so few glimpses would gain from is not worth putting up.
+/// Minimum benefit of a further board, in weighted glimpses.
 const LEAST_WORTH: f64 = 1.5;
-/// Side of a patch: shadows are as sharp. [m]
+/// Side of a patch, which limits the sharpness of shadows. [m]
 const CELL_M: f64 = 0.035;
 
 #[cfg(test)]

@@ -1,15 +1,15 @@
-//! The course's projects: what stands in the net, what the vehicle sees and may know, and the rules,
-//! from one file of text each (`render-server/scenes/projects/*.toml`).
+//! Projects of the course: contents of the net, sensors and known data of the vehicle, and rules. Each is defined by a
+//! file (`render-server/scenes/projects/*.toml`).
 //!
 //! ```text
 //! projects/p5.toml -> CourseProject -> generate(seed, level, variant) -> Generated
 //! ```
-//! The place comes from the seed, as [`generate`](crate::generate) makes it; sensors come from the
-//! level, light from the variant. Called once per flight.
+//! The seed determines the place (see [`generate`](crate::generate)), the level determines the sensors, and the variant
+//! determines light and weather. Called once per flight.
 //!
-//! A new project is its file, its name in [`NAMES`], and its row in `docs/guides/course.md`, which a test
-//! here prints; help, messages and defaults of the command line follow from the file. An instructor's own is a file
-//! beside the program, of the same form ([`CourseProject::find`]).
+//! A new project needs its file, its name in [`NAMES`], and its row in `docs/guides/course.md`, which a test in this
+//! module prints. Help, messages and defaults of the command line follow from the file. Instructors can also define a
+//! project in a separate file of the same format ([`CourseProject::find`]).
 
 use core::fmt;
 use core::str::FromStr;
@@ -27,18 +27,18 @@ use crate::hall::{self, Layout};
 use crate::variant::Variant;
 use crate::{Generated, forest};
 
-/// Lists the files of `../projects`, by name, in the order of the course.
+/// Includes the files of `../projects` by name, in the order of the course.
 macro_rules! projects {
     ($($name:literal)*) => {
-        /// The names of all projects, in the order of the course.
+        /// Names of all projects, in the order of the course.
         pub const NAMES: &[&str] = &[$($name),*];
-        /// The projects' files, in the same order.
+        /// Files of the projects, in the same order.
         const FILES: &[&str] = &[$(include_str!(concat!("../projects/", $name, ".toml"))),*];
     };
 }
 projects!("p2" "p3" "p4" "p5" "forest" "square" "spiral" "lemniscate");
 
-/// One project of the course.
+/// Project of the course.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CourseProject {
     name: Cow<'static, str>,
@@ -46,7 +46,7 @@ pub struct CourseProject {
     plan: ProjectFile,
 }
 
-/// Whom a course is for: with which sensors it is flown.
+/// Level of a course, which determines the sensors.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Level {
     /// Undergraduate: images with depth.
@@ -57,10 +57,10 @@ pub enum Level {
 }
 
 impl Level {
-    /// Every level.
+    /// All levels.
     pub const ALL: [Self; 2] = [Self::Ug, Self::G];
 
-    /// Returns the level's name as the command line takes it.
+    /// Returns the name of the level on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Ug => "ug",
@@ -84,31 +84,31 @@ impl FromStr for Level {
     }
 }
 
-/// A name that is no [`Level`].
+/// Unknown name of a [`Level`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("no level is called '{0}'; give ug (with depth) or g (without)")]
 pub struct UnknownLevel(pub String);
 
-/// A name that is no [`CourseProject`].
+/// Unknown name of a [`CourseProject`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("there is no project '{0}'; there are: {all}", all = NAMES.join(", "))]
 pub struct UnknownProject(pub String);
 
-/// Why a course is that of no project.
+/// Error of [`CourseProject::find`].
 #[derive(Debug, thiserror::Error)]
 pub enum NoProject {
     /// No project has this name.
-    #[error("{0}; or give the path of a file of your own that ends in .toml")]
+    #[error("{0}; or give the path of a project file that ends with .toml")]
     Unknown(UnknownProject),
-    /// Its file cannot be read.
+    /// The file cannot be read.
     #[error("cannot read the project {path}: {1}", path = .0.display())]
     Unreadable(PathBuf, std::io::Error),
-    /// Its file describes no course that can be flown.
-    #[error("{path} is no project: {1}", path = .0.display())]
+    /// The file does not define a valid course.
+    #[error("{path} is not a valid project: {1}", path = .0.display())]
     Wrong(PathBuf, String),
 }
 
-/// The whole of a project's file.
+/// Content of a project file.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ProjectFile {
@@ -121,7 +121,7 @@ struct ProjectFile {
     ground_truth: bool,
     time_limit_s: f64,
     limits: Limits,
-    /// Gates where nothing stands, after those of what does.
+    /// Virtual gates, which come after the gates of the place.
     #[serde(default)]
     stages: Vec<StageConfig>,
     #[serde(default)]
@@ -138,13 +138,13 @@ enum CoursePlace {
     Net(Layout),
 }
 
-/// When a flight has finished.
+/// End of a flight.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 enum Finish {
-    /// In the goal, all stages passed.
+    /// In the goal, after all stages.
     #[serde(rename = "goal")]
     Goal,
-    /// With the last stage passed.
+    /// After the last stage.
     #[serde(rename = "last stage")]
     LastStage,
 }
@@ -159,19 +159,19 @@ struct Levels {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct LevelPlan {
-    /// The allowed setpoints, if not those of `[rules]`.
+    /// Allowed setpoints, if they differ from `[rules]`.
     #[serde(default)]
     setpoints: Option<SetpointKinds>,
     cameras: Vec<CameraConfig>,
     #[serde(default)]
     sensors: Vec<SensorConfig>,
-    /// What a grade's figures are worth.
+    /// Points for the results of a grade.
     #[serde(default)]
     points: Option<PointsTable>,
 }
 
 impl CourseProject {
-    /// Returns the project of a name.
+    /// Returns the built-in project with this name.
     ///
     /// ```
     /// use vizflyt_scenes::projects::{Level, CourseProject};
@@ -188,7 +188,7 @@ impl CourseProject {
     /// [`UnknownProject`], which lists the names.
     ///
     /// # Panics
-    /// If a project's file in this program is wrong, which a test excludes.
+    /// The file of a built-in project is invalid, which a test excludes.
     pub fn named(name: &str) -> Result<Self, UnknownProject> {
         let mut files = NAMES.iter().zip(FILES);
         let (name, text) = files
@@ -198,10 +198,11 @@ impl CourseProject {
         Ok(Self { name: Cow::Borrowed(name), text: Cow::Borrowed(text), plan })
     }
 
-    /// Returns the project of a name, or that of a file, whose path ends in `.toml`; it is called as the file.
+    /// Returns the built-in project with this name, or the project of a file if the path ends with `.toml`. Its name is
+    /// then the name of the file.
     ///
     /// # Errors
-    /// [`NoProject`]: no such name, or a file that cannot be read, or that describes no course that can be flown.
+    /// [`NoProject`]: the name is unknown, or the file cannot be read or does not define a valid course.
     pub fn find(name_or_path: &str) -> Result<Self, NoProject> {
         let path = Path::new(name_or_path);
         if path.extension().is_none_or(|ending| ending != "toml") {
@@ -224,47 +225,47 @@ impl CourseProject {
         Ok(project)
     }
 
-    /// Returns every project.
+    /// Returns all built-in projects.
     pub fn all() -> impl Iterator<Item = Self> {
         NAMES.iter().filter_map(|name| Self::named(name).ok())
     }
 
-    /// Returns its name: `p5`.
+    /// Returns the name, such as `p5`.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Whether it was read from a file, whatever that is called, and is not one of the program.
+    /// Whether the project was read from a file and is not built in, independent of its name.
     pub fn is_from_file(&self) -> bool {
         matches!(self.text, Cow::Owned(_))
     }
 
-    /// Returns what it is about, in a few words.
+    /// Returns the title.
     pub fn title(&self) -> &str {
         &self.plan.title
     }
 
-    /// Returns what is to be done, in a few sentences.
+    /// Returns the description of the task.
     pub fn task(&self) -> &str {
         self.plan.task.trim()
     }
 
-    /// Whether its course ends with the last stage, as races do, not in a goal.
+    /// Whether the course ends with the last stage, as in races, instead of a goal.
     pub fn is_race(&self) -> bool {
         self.plan.finish == Finish::LastStage
     }
 
-    /// Returns within what environments are drawn for it.
+    /// Returns the bounds of random environments.
     pub fn environments(&self) -> &DrawBounds {
         &self.plan.environments
     }
 
-    /// Returns the text of its file, all of its rules: what a grade vouches for.
+    /// Returns the text of the file, which contains all rules. Grades contain its hash.
     pub fn text(&self) -> &str {
         &self.text
     }
 
-    /// Returns what a grade's figures are worth at a level, if the project says it.
+    /// Returns the table of points at a level, if the project has one.
     pub fn points(&self, level: Level) -> Option<&PointsTable> {
         self.level(level).points.as_ref()
     }
@@ -276,8 +277,8 @@ impl CourseProject {
         }
     }
 
-    /// Generates the project's place of a seed, with the sensors of a level, in the environment of a variant.
-    /// The same arguments give the same result on every machine.
+    /// Generates the place of a seed, with the sensors of a level, in the environment of a variant. The same arguments
+    /// give the same result on every machine.
     pub fn generate(&self, seed: u64, level: Level, variant: Variant) -> Generated {
         let plan = &self.plan;
         let mut generated = match plan.place {
@@ -318,7 +319,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_project_of_ones_own_is_a_file() {
+    fn finds_projects_by_name_or_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scanned.toml");
         let found = |text: &str| {
@@ -352,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn environments_are_drawn_within_bounds_that_can_be_flown() {
+    fn bounds_of_environments_are_valid() {
         for project in CourseProject::all() {
             project
                 .environments()
@@ -362,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn the_known_map_is_flown_by_points_and_by_graduates_by_velocities() {
+    fn allows_velocity_setpoints_in_p2_only_for_graduates() {
         let project = CourseProject::all().find(|project| project.name() == "p2").unwrap();
         let allows = |level, kind| {
             let arena = project.generate(3, level, Variant::DAY).arena;
@@ -378,7 +379,7 @@ mod tests {
     }
 
     #[test]
-    fn every_project_makes_a_valid_arena() {
+    fn all_projects_generate_valid_arenas() {
         for (project, &name) in CourseProject::all().zip(NAMES) {
             assert_eq!(project.name(), name);
             assert!(!project.title().is_empty() && project.task().len() > 40, "{name}");
@@ -389,7 +390,7 @@ mod tests {
                 assert_eq!(arena.name, name);
                 let depth = arena.cameras.iter().all(|camera| camera.depth);
                 assert_eq!(depth, level == Level::Ug, "{name} {level}");
-                // A flight can end well: in a goal or with the last stage.
+                // A flight can succeed: in a goal or after the last stage.
                 assert!(arena.goal.is_some() || !arena.stages.is_empty(), "{name}");
             }
         }
@@ -440,7 +441,7 @@ mod tests {
         parts
     }
 
-    /// The paths of the odometry's projects from take-off, each over 0 to 1: what their tasks say. [m]
+    /// Returns the path of an odometry project, relative to the takeoff, for `s` from 0 to 1, as in its task. [m]
     fn path_m(name: &str, s: f64) -> DVec3 {
         match name {
             "square" => {
@@ -472,7 +473,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gates_of_the_odometry_lie_on_its_paths_in_order() {
+    fn gates_of_odometry_projects_lie_on_their_paths_in_order() {
         for name in ["square", "spiral", "lemniscate"] {
             let arena =
                 CourseProject::named(name).unwrap().generate(3, Level::G, Variant::DAY).arena;
@@ -490,7 +491,7 @@ mod tests {
                     passed += 1;
                 }
             }
-            assert_eq!(passed, arena.stages.len(), "{name}: a gate is beside the path");
+            assert_eq!(passed, arena.stages.len(), "{name}: a gate is not on the path");
         }
     }
 

@@ -1,17 +1,17 @@
-//! Random numbers and noise that are the same on every machine: integer hashes, exact arithmetic
-//! and `libm`, never the platform's mathematics library.
+//! Random numbers and noise that are the same on every machine: they use integer hashes, exact arithmetic and `libm`,
+//! but not the platform's mathematics library.
 
 use core::f64::consts::TAU;
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::random::{GOLDEN, SplitMix64, mix, unit};
 
-/// The numbers of one stream of a seed.
+/// Random numbers of a stream of a seed.
 #[derive(Clone, Debug)]
 pub(crate) struct Rng(SplitMix64);
 
 impl Rng {
-    /// Makes the stream `stream` of a seed; streams are independent.
+    /// Returns the stream `stream` of a seed. Streams are independent.
     pub(crate) fn new(seed: u64, stream: u64) -> Self {
         Self(SplitMix64::new(mix(seed ^ mix(stream.wrapping_mul(GOLDEN)))))
     }
@@ -46,13 +46,13 @@ impl Rng {
         self.unit() < probability
     }
 
-    /// Returns a direction, uniform on the sphere.
+    /// Returns a direction with uniform distribution on the sphere.
     pub(crate) fn direction(&mut self) -> DVec3 {
         let z = self.spread(1.0);
         polar(self.angle()).extend(0.0) * (1.0 - z * z).max(0.0).sqrt() + DVec3::Z * z
     }
 
-    /// Returns a roughly normal number of mean 0 and deviation 1 (sum of four uniforms).
+    /// Returns a number with approximately normal distribution, mean 0 and standard deviation 1 (sum of four uniforms).
     pub(crate) fn normal(&mut self) -> f64 {
         let sum = self.unit() + self.unit() + self.unit() + self.unit();
         (sum - 2.0) * 3f64.sqrt()
@@ -64,7 +64,7 @@ pub(crate) fn polar(angle_rad: f64) -> DVec2 {
     DVec2::new(libm::cos(angle_rad), libm::sin(angle_rad))
 }
 
-/// Returns smooth noise in [0, 1] whose features are about 1 wide.
+/// Returns smooth noise in [0, 1] with features of about unit width.
 pub(crate) fn noise(seed: u64, p: DVec3) -> f64 {
     let cell = p.floor();
     let f = p - cell;
@@ -96,20 +96,20 @@ pub(crate) fn noise2(seed: u64, p: DVec2) -> f64 {
     )
 }
 
-/// Returns noise over the plane in about [0, 1] with detail: `octaves` halvings of size and height.
+/// Returns noise over the plane in about [0, 1] with `octaves` levels of detail, each with half the size and amplitude.
 pub(crate) fn fractal2(seed: u64, p: DVec2, octaves: u32) -> f64 {
     let (mut sum, mut height, mut total, mut q) = (0.0, 1.0, 0.0, p);
     for octave in 0..octaves {
         sum += height * noise2(seed.wrapping_add(u64::from(octave)), q);
         total += height;
         height *= 0.5;
-        // A factor other than 2 and a shift keep the octaves' lattices from lining up.
+        // A factor other than 2 and a shift avoid aligned lattices of the octaves.
         q = q * 2.03 + DVec2::new(17.1, 5.3);
     }
     sum / total
 }
 
-/// Returns 0 below `low`, 1 above `high`, and a smooth ramp between.
+/// Returns 0 below `low`, 1 above `high`, and a smooth ramp in between.
 pub(crate) fn smoothstep(low: f64, high: f64, x: f64) -> f64 {
     let t = ((x - low) / (high - low)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
@@ -127,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn draws_are_even_and_streams_differ() {
+    fn draws_have_the_right_moments_and_streams_differ() {
         let mut rng = Rng::new(1, 2);
         let mean = (0..10_000).map(|_| rng.unit()).sum::<f64>() / 1e4;
         assert!((mean - 0.5).abs() < 0.02);

@@ -1,9 +1,9 @@
-//! The true geometry, indexed: distance, rays, and how open the sky is above a point.
+//! Indexed true geometry: distances, and ambient openness of surface points.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
 
-/// Volumes with a grid over x and y, so that a query looks at what is near only.
+/// Volumes with a grid over x and y, so that a query only tests near volumes.
 #[derive(Debug)]
 pub(crate) struct Solids {
     volumes: Vec<Volume>,
@@ -16,7 +16,7 @@ pub(crate) struct Solids {
 }
 
 impl Solids {
-    /// Indexes the volumes.
+    /// Builds the index.
     pub(crate) fn new(volumes: Vec<Volume>) -> Self {
         let boxes: Vec<Option<(DVec3, DVec3)>> = volumes.iter().map(bounds).collect();
         let (mut low, mut high) = (DVec3::splat(f64::MAX), DVec3::splat(f64::MIN));
@@ -55,13 +55,11 @@ impl Solids {
         solids
     }
 
-    /// Returns the volumes.
     pub(crate) fn into_volumes(self) -> Vec<Volume> {
         self.volumes
     }
 
-    /// Returns the signed distance to the nearest volume, or [`REACH_M`] if none is that near;
-    /// half spaces always count. [m]
+    /// Returns the signed distance to the nearest volume, at most [`REACH_M`]; includes half spaces. [m]
     pub(crate) fn distance_m(&self, p_m: DVec3) -> f64 {
         let mut nearest = self.distance_to_bodies_m(p_m);
         for &index in &self.everywhere {
@@ -70,7 +68,7 @@ impl Solids {
         nearest
     }
 
-    /// As [`Self::distance_m`], without half spaces (the floor).
+    /// Same as [`Self::distance_m`], but without half spaces (the floor).
     pub(crate) fn distance_to_bodies_m(&self, p_m: DVec3) -> f64 {
         let mut nearest = REACH_M;
         let (column, row) = ((p_m.x - self.min_x_m) / CELL_M, (p_m.y - self.min_y_m) / CELL_M);
@@ -86,8 +84,8 @@ impl Solids {
         nearest
     }
 
-    /// Returns how open the half space above a surface point is to ambient light, 0 to 1: compares
-    /// the distance field along the normal with that of a lone plane (Evans, SIGGRAPH 2006).
+    /// Returns the openness of a surface point to ambient light, 0 to 1. It compares the distance field along the
+    /// normal with that of a single plane (Evans, SIGGRAPH 2006).
     pub(crate) fn openness(&self, p_m: DVec3, normal: DVec3) -> f64 {
         let mut blocked = 0.0;
         for (step_m, weight) in [(0.06, 0.9), (0.15, 0.7), (0.35, 0.55), (0.7, 0.35)] {
@@ -98,7 +96,7 @@ impl Solids {
     }
 }
 
-/// Returns the corners of a volume's bounding box; `None` if it has no bounds.
+/// Returns the corners of a volume's bounding box; `None` if it is unbounded.
 pub(crate) fn bounds(volume: &Volume) -> Option<(DVec3, DVec3)> {
     match *volume {
         Volume::Sphere { center_m, radius_m } => {
@@ -117,7 +115,7 @@ pub(crate) fn bounds(volume: &Volume) -> Option<(DVec3, DVec3)> {
     }
 }
 
-/// How far a volume has influence. [m]
+/// Maximum distance that a query returns. [m]
 pub(crate) const REACH_M: f64 = 1.0;
 const CELL_M: f64 = 0.5;
 
@@ -128,7 +126,7 @@ mod tests {
     use glam::DQuat;
 
     #[test]
-    fn the_grid_gives_the_plain_minimum() {
+    fn the_index_returns_the_exact_minimum() {
         let mut rng = Rng::new(5, 0);
         let point = |rng: &mut Rng| DVec3::new(rng.spread(6.0), rng.spread(4.0), rng.spread(2.0));
         let mut volumes = vec![Volume::HalfSpace { normal: DVec3::Z, offset_m: -1.0 }];
@@ -151,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn a_corner_is_darker_than_the_open() {
+    fn corners_are_less_open_than_free_surfaces() {
         let solids = Solids::new(vec![
             Volume::HalfSpace { normal: DVec3::Z, offset_m: 0.0 },
             Volume::aabb(DVec3::new(0.0, -2.0, 0.0), DVec3::new(0.2, 2.0, 2.0)),

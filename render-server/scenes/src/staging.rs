@@ -1,5 +1,5 @@
-//! A scene that is made to be filmed: the walk through it is planned among its solids, and boards for prints are put up along
-//! the walk, before anything is painted. [`Staging::none`] leaves a scene as it is.
+//! Staging of a scene for a capture. Before a scene is painted, a walk is planned between its solids, and boards for
+//! prints are added along the walk. [`Staging::none`] leaves a scene unchanged.
 
 use glam::{DVec2, DVec3};
 use vizflyt_arena::config::Geofence;
@@ -12,27 +12,27 @@ use crate::solids::Solids;
 use crate::walk::{Ground, NoWalk, Walk};
 use crate::{forest, hall};
 
-/// A generated scene, a walk through it, and the sheets that were put up for it.
+/// Generated scene, walk through it, and sheets along the walk.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilmSet {
-    /// The scene, with boards in splats and truth where sheets were asked for.
+    /// Scene; its splats and truth include the boards if sheets were requested.
     pub scene: Generated,
-    /// Where the camera is, at any instant.
+    /// Motion of the camera.
     pub walk: Walk,
-    /// White sheets to print on; empty where none were asked for.
+    /// White sheets for prints; empty if not requested.
     pub prints: Vec<Print>,
 }
 
-/// Generates a scene and a closed walk through it of this duration; `with_prints` puts up boards along the walk.
+/// Generates a scene and a closed walk of this duration. `with_prints` adds boards along the walk.
 ///
 /// # Errors
-/// [`NoWalk`] for a duration outside of [`Walk::SECONDS`], or where there is no room for a person.
+/// [`NoWalk`] if the duration is outside of [`Walk::SECONDS`], or if there is no space for a person.
 ///
 /// ```
 /// use vizflyt_scenes::{SceneKind, film_set};
 /// let set = film_set(SceneKind::Room, 3, 20.0, true)?;
 /// assert!(set.prints.len() >= 6);
-/// // It ends where it began.
+/// // The walk ends at its start.
 /// let (begin, end) = (set.walk.world_from_cam(0.0), set.walk.world_from_cam(20.0));
 /// assert!((begin.translation_m - end.translation_m).length() < 1e-9);
 /// # Ok::<(), vizflyt_scenes::walk::NoWalk>(())
@@ -55,7 +55,7 @@ pub fn film_set(
     Ok(FilmSet { scene, walk, prints: staging.boards.iter().map(Board::print).collect() })
 }
 
-/// What is asked of a scene's builder besides the scene, and what comes of it.
+/// Request for a walk and boards, and its results. The builder of a scene fills it.
 #[derive(Debug)]
 pub(crate) struct Staging {
     asked: Option<Asked>,
@@ -70,27 +70,27 @@ struct Asked {
     with_prints: bool,
 }
 
-/// What a builder knows of its place.
+/// Description of a place for the planning.
 pub(crate) struct Stage<'a> {
-    /// Where vehicles fly; what is to be filmed.
+    /// Fence of the flights, which is the space to capture.
     pub(crate) fence: &'a Geofence,
-    /// How far about the fence one may walk; negative keeps inside. [m]
+    /// Width of the walkable area around the fence; negative: inside the fence. [m]
     pub(crate) around_m: f64,
-    /// Walls: a point at the floor, the inward normal, and the reach to both sides of the point. [m, world]
+    /// Walls: a point at the floor, the inward normal, and the extent to both sides of the point. [m, world]
     pub(crate) walls: &'a [(DVec3, DVec3, f64)],
-    /// What moves, and is kept away from. [m, world]
+    /// Volumes of moving objects, which the walk avoids. [m, world]
     pub(crate) movers: &'a [Volume],
-    /// Whether posts stand outside of the fence only.
+    /// Whether posts must stand outside of the fence.
     pub(crate) fence_is_kept_free: bool,
 }
 
 impl Staging {
-    /// Asks for nothing.
+    /// Returns a staging without walk and boards.
     pub(crate) fn none() -> Self {
         Self { asked: None, walk: None, boards: Vec::new() }
     }
 
-    /// Plans the walk and the boards, which join the true solids.
+    /// Plans the walk and the boards, and adds the boards to the true solids.
     pub(crate) fn put_up(&mut self, truth: &mut Vec<Volume>, stage: &Stage<'_>) {
         let Some(Asked { seed, seconds, with_prints }) = self.asked else { return };
         let solids = Solids::new(truth.clone());
@@ -108,7 +108,7 @@ impl Staging {
         self.walk = Some(walk);
     }
 
-    /// Paints the boards; `matt(point, normal, albedo)` is the light that leaves a matt surface.
+    /// Paints the boards. `matt(point, normal, albedo)` returns the light that leaves a matt surface.
     pub(crate) fn paint(
         &self,
         canvas: &mut Canvas,

@@ -1,5 +1,5 @@
-//! What every generated scene promises: the same bytes for the same seed, valid splats, pictures
-//! that agree with the truth, room to fly, and files that read back.
+//! Properties of all generated scenes: the same bytes for the same seed, valid splats, images that agree with the
+//! truth, space to fly, and files that can be read again.
 
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_arena::ArenaConfig;
@@ -11,7 +11,7 @@ use crate::solids::{REACH_M, Solids};
 
 mod ranges;
 
-/// FNV-1a over every number of the splats and the truth.
+/// Returns the FNV-1a hash of all numbers of splats and truth.
 fn fingerprint(scene: &Generated) -> u64 {
     let Splats { means_m, scales_m, rotations, opacities, sh_degree: _, sh, antialiased: _ } =
         &scene.splats;
@@ -33,17 +33,17 @@ fn fingerprint(scene: &Generated) -> u64 {
 }
 
 #[test]
-fn a_seed_gives_the_same_scene_and_another_a_different_one() {
+fn the_seed_determines_the_scene() {
     for kind in SceneKind::ALL {
         let first = fingerprint(&generate(kind, 7));
         assert_eq!(first, fingerprint(&generate(kind, 7)), "{kind}");
-        // Pinned: another machine, compiler or library that changes a bit changes every grade
-        // flown here. A deliberate change of a scene changes its number, too.
+        // Pinned: if another machine, compiler or library changes a bit, all grades flown in this scene change. A
+        // deliberate change of a scene must also change its number.
         let pinned: Option<u64> = match kind {
             SceneKind::Forest => Some(0x178a3ce16d9310de),
             SceneKind::Race => Some(0xb1f89634a12b57a8),
             SceneKind::Room => Some(0x5b38330facfd1bad),
-            // No grade is flown among these.
+            // This scene is not used for grades.
             SceneKind::Moving => None,
         };
         assert!(pinned.is_none_or(|pinned| first == pinned), "{kind}: {first:#018x}");
@@ -93,7 +93,7 @@ fn start_goal_and_stages_are_free() {
             for stage in &arena.stages {
                 let free_m = clearance_m(stage.center_m);
                 assert!(free_m >= 0.35, "{kind} {seed}: {free_m} m in {}", stage.name);
-                // So are the last half metre before it and the first behind.
+                // The last half metre before the stage and the first behind it are also free.
                 for along_m in [-0.5, -0.25, 0.25, 0.5] {
                     let free_m = clearance_m(stage.center_m + stage.normal * along_m);
                     assert!(free_m >= 0.25, "{kind} {seed}: {free_m} m about {}", stage.name);
@@ -133,7 +133,7 @@ fn written_files_read_back() {
         let text = std::fs::read_to_string(&written.truth).unwrap();
         let truth: Vec<Volume> = serde_json::from_str(&text).unwrap();
         assert_eq!(truth.len(), scene.truth.len());
-        // JSON's reader may be off by the last bit.
+        // The JSON parser may be off by the last bit.
         for (a, b) in truth.iter().zip(&scene.truth) {
             for p_m in [DVec3::new(3.0, 0.5, 1.2), DVec3::new(9.0, -2.0, 0.3)] {
                 assert!((a.signed_distance_m(p_m) - b.signed_distance_m(p_m)).abs() < 1e-9);
@@ -156,20 +156,20 @@ fn names_parse_and_print() {
     assert!(error.contains("'wood'") && error.contains(&SceneKind::names()), "{error}");
 }
 
-/// How far pictures stray from the truth, in pixels whose ray meets it within 10 m.
+/// Differences between images and truth, over pixels with a hit within 10 m.
 #[derive(Debug, Default)]
 struct Agreement {
-    /// Obstacles in the flight space.
+    /// Pixels of obstacles in the flight space.
     obstacle_pixels: usize,
     obstacle_misses: usize,
-    /// The floor, and walls beyond the fence.
+    /// Pixels of the floor and of walls beyond the fence.
     ground_pixels: usize,
     ground_misses: usize,
     thin: usize,
 }
 
-/// Compares rendered median depth with rays cast at the truth within a volume. Pixels next to an outline are left
-/// out: there a pixel holds both what is near and what is behind.
+/// Compares rendered median depth with rays cast at the truth within a volume. Pixels next to an outline are skipped,
+/// because they contain both foreground and background.
 fn compare(scene: &Generated, within: &Volume, poses: &[(DVec3, f64, f64)]) -> Agreement {
     let solids = Solids::new(scene.truth.clone());
     let fence = scene.arena.geofence();
@@ -187,7 +187,7 @@ fn compare(scene: &Generated, within: &Volume, poses: &[(DVec3, f64, f64)]) -> A
         renderer.render(&[], std::slice::from_ref(&camera), &mut images).unwrap();
         let [seen] = images;
 
-        // (camera-z depth, whether it is the floor) of what each pixel's centre sees.
+        // (Depth along the optical axis, whether it is the floor) at each pixel's centre.
         let truth: Vec<Option<(f64, bool)>> = (0..k.pixels())
             .map(|i| {
                 let (u, v) = (i as u32 % width, i as u32 / width);
@@ -232,8 +232,8 @@ fn compare(scene: &Generated, within: &Volume, poses: &[(DVec3, f64, f64)]) -> A
                 let truth_at_m =
                     world_from_cam.transform_point(k.unproject(pixel, truth_m).unwrap());
                 if floor || fence.signed_distance_m(truth_at_m) > 0.0 {
-                    // At a grazing angle a millimetre across a surface is decimetres of depth:
-                    // here what counts is how far from the true surface the seen point lies.
+                    // At a grazing angle, a millimetre across a surface is decimetres of depth. Therefore, this
+                    // compares the distance of the visible point from the true surface.
                     let q_m = world_from_cam.transform_point(k.unproject(pixel, depth_m).unwrap());
                     sum.ground_pixels += 1;
                     // Walls beyond the fence are painted coarsely.

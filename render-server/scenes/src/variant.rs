@@ -1,4 +1,4 @@
-//! The same place in another light or weather: what a plugin must cope with besides the seed.
+//! Variants of a place with other light or weather, which a plugin must handle in addition to other seeds.
 
 use core::fmt;
 use core::str::FromStr;
@@ -7,7 +7,7 @@ use vizflyt_arena::config::EnvironmentConfig;
 
 use crate::draw::DrawBounds;
 
-/// One of the environments that have a name, [`EnvironmentConfig::NAMED`], or one that was drawn.
+/// Named environment of [`EnvironmentConfig::NAMED`], or a random one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Variant {
     name: VariantName,
@@ -17,12 +17,12 @@ pub struct Variant {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum VariantName {
     Known(&'static str),
-    /// Its number among those that were drawn, from 1.
+    /// Number of the random environment, from 1.
     Drawn(u64),
 }
 
 impl Variant {
-    /// As captured.
+    /// Unchanged light and weather.
     pub const DAY: Self =
         Self::known(EnvironmentConfig::NAMED[0].0, &EnvironmentConfig::NAMED[0].1);
 
@@ -30,25 +30,25 @@ impl Variant {
         Self { name: VariantName::Known(name), environment }
     }
 
-    /// Returns the variant of a number, from 1, of those that are drawn from a seed within bounds.
+    /// Returns random variant `number` (from 1) of a seed, within bounds.
     pub fn drawn(seed: u64, number: u64, bounds: &DrawBounds) -> Self {
-        // Why: a command draws at most `MAX_DRAWN`, and needs them until it ends; so a variant is as small and as easily
-        // copied as a name.
+        // Why: a command draws at most `MAX_DRAWN` variants and needs them until its end. The leak keeps a variant
+        // small and `Copy`.
         let environment = Box::leak(Box::new(bounds.draw(seed, number)));
         Self { name: VariantName::Drawn(number), environment }
     }
 
-    /// Whether it was drawn.
+    /// Whether the variant is random.
     pub fn is_drawn(&self) -> bool {
         matches!(self.name, VariantName::Drawn(_))
     }
 
-    /// Returns the names of all, as help and messages list them.
+    /// Returns the names of all named variants, for help and messages.
     pub fn names() -> String {
         EnvironmentConfig::NAMED.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ")
     }
 
-    /// Returns what it is.
+    /// Returns light and weather.
     pub fn environment(&self) -> EnvironmentConfig {
         *self.environment
     }
@@ -64,7 +64,7 @@ impl fmt::Display for Variant {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.name {
             VariantName::Known(name) => f.pad(name),
-            // Sorted as text, they are in order.
+            // Two digits, so that the names sort by number.
             VariantName::Drawn(number) => f.pad(&format!("random-{number:02}")),
         }
     }
@@ -82,16 +82,16 @@ impl FromStr for Variant {
     }
 }
 
-/// What `--variants` lists: variants by name, or `random:20`, as many that are drawn.
+/// Entry of `--variants`: a name, or `random:20` for this number of random variants.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum VariantChoice {
-    /// One that has a name.
+    /// Named variant.
     Named(Variant),
-    /// So many, drawn from a seed that is known later.
+    /// Number of random variants; their seed is known later.
     Random(u64),
 }
 
-/// Drawn at most: a grade's document has room for these and all that have a name.
+/// Maximum number of random variants: the document of a grade has space for these and all named ones.
 pub const MAX_DRAWN: u64 = 40;
 
 impl FromStr for VariantChoice {
@@ -111,7 +111,7 @@ impl FromStr for VariantChoice {
     }
 }
 
-/// A name that is no [`Variant`].
+/// Unknown name of a [`Variant`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("no variant is called '{0}'; there are {all}", all = Variant::names())]
 pub struct UnknownVariant(pub String);
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn lists_take_names_and_numbers_to_draw() {
+    fn parses_names_and_random_counts() {
         assert_eq!("night".parse(), Ok(VariantChoice::Named("night".parse().unwrap())));
         assert_eq!("random:20".parse(), Ok(VariantChoice::Random(20)));
         for wrong in ["random:0", "random:41", "random:", "random:x", "random", "noon"] {

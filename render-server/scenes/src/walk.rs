@@ -1,10 +1,10 @@
-//! A walk with a phone through a generated scene: where the camera is at any instant.
+//! Walk with a phone through a generated scene: pose of the camera at any time.
 //!
-//! Data flow: [`route`] finds a closed way over the free floor by the true solids; the walk follows it evenly, turns
-//! its gaze smoothly to one side and then to the other, and adds what a hand does ([`sway`]). Every motion has a whole number
-//! of periods in the walk, so that its end is its beginning.
+//! Data flow: [`route`] finds a closed path over the free floor, based on the true solids. The walk follows it at
+//! constant speed, turns its gaze smoothly to one side and then to the other, and adds the motion of a hand ([`sway`]).
+//! Each motion has an integer number of periods in the walk, so that the end matches the start.
 //!
-//! Called once per capture; [`Walk::world_from_cam`] some ten times per image, at less than a microsecond.
+//! Called once per capture. [`Walk::world_from_cam`] is called about ten times per image and takes less than 1 us.
 
 mod route;
 mod sway;
@@ -18,39 +18,39 @@ use crate::random::Rng;
 pub(crate) use route::Ground;
 use sway::Sway;
 
-/// A closed walk of a given duration.
+/// Closed walk of a given duration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Walk {
     seconds: f64,
     length_m: f64,
-    /// At even distances along the way, closed; the gaze's direction without whole turns lost.
+    /// Steps at even distances along the closed path; the yaw of the gaze is unwrapped.
     steps: Vec<Standpoint>,
     sway: Sway,
 }
 
-/// Where the walker is, and looks.
+/// Position and gaze of the walker.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Standpoint {
     at_m: DVec2,
     yaw_rad: f64,
 }
 
-/// Why nobody can walk here.
+/// Why a walk is not possible.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum NoWalk {
     /// There is no free floor within the fence.
-    #[error("no free floor of a walker's width within the fence; nobody can film here")]
+    #[error("no free floor of a walker's width within the fence, so a capture is not possible")]
     NoFloor,
-    /// The time is no number of seconds within limits.
+    /// The duration is outside of its limits.
     #[error("a walk of {0} s: give 2 to 600 s")]
     Duration(f64),
 }
 
 impl Walk {
-    /// Shortest and longest walk. [s]
+    /// Allowed durations. [s]
     pub const SECONDS: core::ops::RangeInclusive<f64> = 2.0..=600.0;
 
-    /// Plans a walk over free ground; the same ground, seed and duration give the same walk.
+    /// Plans a walk over free ground. The same ground, seed and duration give the same walk.
     pub(crate) fn plan(ground: &Ground<'_>, seed: u64, seconds: f64) -> Result<Self, NoWalk> {
         if !Self::SECONDS.contains(&seconds) {
             return Err(NoWalk::Duration(seconds));
@@ -64,23 +64,23 @@ impl Walk {
         Ok(Self { seconds, length_m, steps, sway: Sway::draw(&mut rng, seconds) })
     }
 
-    /// Returns how long it takes. [s]
+    /// Returns the duration. [s]
     pub fn seconds(&self) -> f64 {
         self.seconds
     }
 
-    /// Returns how long the way is. [m]
+    /// Returns the length of the path. [m]
     pub fn length_m(&self) -> f64 {
         self.length_m
     }
 
-    /// Returns where the camera is at an instant; the walk repeats. [s since its beginning]
+    /// Returns the pose of the camera at a time; the walk repeats. [s since its start]
     pub fn world_from_cam(&self, at_s: f64) -> Pose<World, Cam> {
         let turn = at_s / self.seconds - libm::floor(at_s / self.seconds);
         let (at_m, yaw_rad) = self.on_way(turn);
         let sway = self.sway.at(turn);
         let (yaw_rad, pitch_rad) = (yaw_rad + sway.yaw_rad, sway.pitch_rad);
-        // Ahead is the world's x before it is turned: right is -y, down is -z.
+        // Before the rotation, the camera looks along the world's x axis: right is -y, down is -z.
         let level = DQuat::from_mat3(&DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X));
         let rotation = turned(DVec3::Z, yaw_rad)
             * turned(DVec3::NEG_Y, pitch_rad)
@@ -90,14 +90,14 @@ impl Walk {
         Pose::new(at_m.extend(sway.height_m) + aside, rotation.normalize())
     }
 
-    /// Returns place and gaze at a share of the walk: cubic between steps (Catmull and Rom 1974), so that
-    /// speeds do not jump.
+    /// Returns position and gaze at a share of the walk, with cubic interpolation between steps (Catmull and Rom 1974),
+    /// so that the speed is continuous.
     fn on_way(&self, turn: f64) -> (DVec2, f64) {
         let count = self.steps.len();
         let along = turn * count as f64;
         let first = (along as usize).min(count - 1);
         let t = along - first as f64;
-        // Whole turns that the gaze makes on the way carry over the seam.
+        // Full turns of the gaze along the path must continue over the seam.
         let whole = {
             let (begin, end) = (self.steps[0].yaw_rad, self.steps[count - 1].yaw_rad);
             TAU * libm::round((end - begin) / TAU)
@@ -118,8 +118,8 @@ impl Walk {
     }
 }
 
-/// Turns the gaze along the way: to the left of it for one half of the time, to the right for the other, as who
-/// films a room does, so that each place is seen from two sides.
+/// Returns the steps with the gaze to the left of the path for half of the time, and to the right for the other half,
+/// so that each place is seen from two sides.
 fn look_about(way: &[DVec2]) -> Vec<Standpoint> {
     let count = way.len();
     let mut yaws = Vec::with_capacity(count);
@@ -133,7 +133,7 @@ fn look_about(way: &[DVec2]) -> Vec<Standpoint> {
         last = Some(yaw);
         yaws.push(yaw);
     }
-    // How far the heading turns from the last step to the first, once around.
+    // Full turns of the heading over one lap.
     let whole = TAU * libm::round((yaws[count - 1] - yaws[0]) / TAU);
     let aside = |n: usize| {
         let phase = TAU * (n as f64 / count as f64 - 0.25);
@@ -157,18 +157,18 @@ fn look_about(way: &[DVec2]) -> Vec<Standpoint> {
     (0..count).map(|n| Standpoint { at_m: way[n], yaw_rad: smooth(n) }).collect()
 }
 
-/// Returns a turn about a unit axis, by the same mathematics on every machine.
+/// Returns a rotation about a unit axis, computed identically on every machine.
 fn turned(axis: DVec3, angle_rad: f64) -> DQuat {
     let (sin, cos) = (libm::sin(0.5 * angle_rad), libm::cos(0.5 * angle_rad));
     DQuat::from_xyzw(axis.x * sin, axis.y * sin, axis.z * sin, cos)
 }
 
-/// Distance between kept places of the way. [m]
+/// Distance between the steps of the path. [m]
 const STEP_M: f64 = 0.1;
-/// The gaze follows the way's turns over this distance, one standard deviation: a quarter turn takes
-/// about three seconds, less than 60 degrees a second at its fastest. [m]
+/// Standard deviation of the smoothing of the gaze along the path: a quarter turn takes about three seconds, with less
+/// than 60 degrees per second. [m]
 const GAZE_M: f64 = 0.9;
-/// How far aside of the way the gaze is. [rad]
+/// Angle between gaze and path. [rad]
 const SIDE_RAD: f64 = 0.85;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Stores a generated scene in a folder.
+//! Writes a generated scene to a folder.
 
 use std::fs;
 use std::io;
@@ -9,48 +9,45 @@ use vizflyt_splat::ply;
 
 use crate::generated::Generated;
 
-/// Where a scene was stored.
+/// Paths of the written files.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Written {
-    /// The splats, in the standard 3DGS PLY layout.
+    /// Splats in the standard 3DGS PLY layout.
     pub scene: PathBuf,
-    /// The arena, which names the scene.
+    /// Arena, which refers to the scene.
     pub arena: PathBuf,
-    /// The true solids: a JSON array of `Volume`.
+    /// True solids: a JSON array of `Volume`.
     pub truth: PathBuf,
-    /// The same, for plugins, where the map is known.
+    /// Map for plugins with the same content, if plugins may read it.
     pub map: Option<PathBuf>,
 }
 
-/// Why a scene could not be stored.
+/// Error of [`Generated::write`].
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
     /// The folder or a text file could not be written.
-    #[error("cannot write {}: {cause}; give a folder on a disk with room", path.display())]
+    #[error("cannot write {}: {cause}; give a folder on a disk with enough space", path.display())]
     Io {
-        /// What was to be written.
         path: PathBuf,
-        /// The system's error.
         cause: io::Error,
     },
     /// The splats could not be written.
     #[error(transparent)]
     Splats(#[from] ply::PlyError),
-    /// The arena has no text form.
+    /// The arena cannot be serialized.
     #[error("cannot write the arena: {0}")]
     Arena(ConfigError),
-    /// The truth has no text form.
+    /// The truth cannot be serialized.
     #[error("cannot write the truth: {0}")]
     Truth(serde_json::Error),
 }
 
 impl Generated {
-    /// Writes `scene.ply`, the splats of each object, `arena.toml`, `truth.json` and
-    /// `truth-objects.json` into a folder, which is made if absent, and `map.json` where the map is
-    /// known; replaces what has these names.
+    /// Writes `scene.ply`, the splats of each object, `arena.toml`, `truth.json`, `truth-objects.json` and, if plugins
+    /// may read the map, `map.json` into a folder. Creates the folder if it is missing, and replaces existing files.
     ///
     /// # Errors
-    /// [`WriteError::Io`] and [`WriteError::Splats`] name the file that could not be written.
+    /// [`WriteError::Io`] and [`WriteError::Splats`] contain the path of the file.
     pub fn write(&self, dir: &Path) -> Result<Written, WriteError> {
         let io_error = |path: &Path| {
             let path = path.to_owned();
@@ -75,7 +72,7 @@ impl Generated {
             fs::write(map, &truth).map_err(io_error(map))?;
         }
         fs::write(&written.truth, truth).map_err(io_error(&written.truth))?;
-        // The arena last: where it stands, the rest is complete.
+        // The arena is written last, so that a folder with an arena is complete.
         let arena = self.arena.to_toml().map_err(WriteError::Arena)?;
         fs::write(&written.arena, arena).map_err(io_error(&written.arena))?;
         Ok(written)

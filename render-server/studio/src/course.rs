@@ -1,4 +1,4 @@
-//! The course that is flown for a grade: an instance of a project, generated from a seed.
+//! Course of a graded flight: an instance of a project, generated from a seed.
 
 use std::sync::Arc;
 
@@ -14,28 +14,28 @@ use vizflyt_server::scene::{bake_with, obstacles};
 use vizflyt_splat::{RigidObject, Splats};
 use vizflyt_trust::hex;
 
-/// A course to fly, in memory. It is nowhere but in this process's memory.
+/// Generated course. It exists only in the memory of this process, so that no plugin can read it.
 pub struct CourseInstance {
-    /// The room and its rules.
+    /// Room and rules.
     pub arena: ArenaConfig,
-    /// What cameras see. [m, world]
+    /// Static splats. [m, world]
     pub splats: Splats,
-    /// What moves in it. [m, object]
+    /// Moving objects. [m, object]
     pub objects: Vec<RigidObject>,
-    /// What stands still, as the referee judges by it.
+    /// Distance field of the static obstacles, for the referee.
     pub field: Arc<DistanceField>,
-    /// That, and what moves; its clock is 0 at the start of a flight.
+    /// Static and moving obstacles; their clock is 0 at the start of a flight.
     pub obstacles: Obstacles,
-    /// The map that plugins may know, as JSON, where it is known.
+    /// Map for plugins as JSON, if the course provides one.
     pub map: Option<String>,
-    /// SHA-256 of what cameras see.
+    /// SHA-256 of splats, objects, light and weather.
     pub scene_sha256: String,
-    /// SHA-256 of the rules: the project's file and the arena's.
+    /// SHA-256 of the rules: project file and arena file.
     pub rules_sha256: String,
 }
 
-/// Returns a project's name as grades have it. One from a file bears what it says, too: it is another project when it was
-/// changed, and never one of the program's that its file is called after.
+/// Returns the name of a project in grades. The name of a project from a file includes a hash of the file: a changed
+/// file is another project, and no file can pass for one of the built-in projects.
 pub fn graded_name(project: &CourseProject) -> String {
     let name = project.name();
     if !project.is_from_file() {
@@ -49,7 +49,7 @@ impl CourseInstance {
     /// Generates the course of a seed.
     ///
     /// # Errors
-    /// If a sensor's model is none, or its arena cannot be written down: a test of the program's own projects excludes both.
+    /// A sensor model is invalid, or the arena cannot be serialized. A test excludes both for the built-in projects.
     pub fn make(
         project: &CourseProject,
         level: Level,
@@ -58,21 +58,21 @@ impl CourseInstance {
     ) -> Result<Self> {
         let generated = project.generate(seed, level, variant);
         SensorSet::new(&generated.arena.sensors).context("the course's sensors")?;
-        // Not kept for later: on disk it would be a map for the next plugin.
+        // Not cached: on the disk, it would be a map for the next plugin.
         let baked =
             bake_with(&generated.splats, &BakeSpec::of(&generated.arena), None, None, &|_| ());
-        // Light and fog belong to what cameras see.
+        // Light and fog are part of the scene's hash, not of the rules' hash.
         let environment = generated.arena.environment;
         let rules =
             ArenaConfig { environment: EnvironmentConfig::default(), ..generated.arena.clone() };
-        let rules = rules.to_toml().context("the arena cannot be written down")?;
+        let rules = rules.to_toml().context("the arena cannot be serialized")?;
         let mut hash = Sha256::new();
         hash.update(project.text());
         hash.update([0]);
         hash.update(rules);
         let field = Arc::new(baked.field);
         let truth = Some(&generated.truth).filter(|_| generated.map_is_known);
-        let map = truth.map(serde_json::to_string).transpose().context("the map has no text")?;
+        let map = truth.map(serde_json::to_string).transpose().context("the map cannot be serialized")?;
         let obstacles = obstacles(&generated.arena, &generated.objects, field.clone(), seed);
         Ok(Self {
             scene_sha256: hash_of(&generated.splats, &generated.objects, &environment)?,
@@ -109,8 +109,8 @@ fn hash_of(
             ..EnvironmentConfig::CLEAR
         })
     {
-        // Numbers as people read them: the same text is the same weather.
-        hash.update(serde_json::to_string(environment).context("weather has no text")?);
+        // Weather is hashed as its text: the same numbers give the same text.
+        hash.update(serde_json::to_string(environment).context("the weather cannot be serialized")?);
     }
     Ok(hex(&hash.finalize()))
 }
@@ -140,7 +140,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_is_never_one_of_the_programs_projects() {
+    fn a_project_from_a_file_never_has_the_name_of_a_built_in_one() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("p4.toml");
         let found = |text: &str| {
@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_is_known_by_its_hashes() {
+    fn hashes_distinguish_scene_weather_and_rules() {
         let project = CourseProject::named("forest").unwrap();
         let course =
             |variant, seed| CourseInstance::make(&project, Level::Ug, variant, seed).unwrap();

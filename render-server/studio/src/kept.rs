@@ -1,9 +1,9 @@
-//! Generated scenes, kept for the next start by what they were generated from.
+//! Cache of generated scenes on the disk, keyed by the parameters of their generation.
 //!
-//! Each is a folder as [`Generated::write`](vizflyt_scenes::Generated::write) makes it, named by a hash of what it was
-//! generated from and of this program, so that another build makes its own. It is made aside and moved into its place
-//! whole, with a checksum of its files: one that does not match is made anew. The ones used longest ago go when all
-//! are over [`MAX_BYTES`].
+//! Each scene is a folder written by [`Generated::write`](vizflyt_scenes::Generated::write). Its name is a hash of the
+//! parameters and of this program, so that each build has its own scenes. A scene is written to a temporary folder and
+//! moved to its place when complete, with a checksum of its files. If the checksum does not match later, the scene is
+//! generated again. If all scenes together exceed [`MAX_BYTES`], the least recently used ones are removed.
 
 use std::fs::{self, File, Permissions};
 use std::io::{self, Write};
@@ -16,19 +16,19 @@ use sha2::{Digest, Sha256};
 use tracing::warn;
 use vizflyt_trust::hex;
 
-/// A folder of generated scenes.
+/// Cache folder of generated scenes.
 #[derive(Debug)]
 pub(super) struct KeptScenes {
     folder: PathBuf,
     max_bytes: u64,
 }
 
-/// The identity of a generated scene: what it is generated from, and by which program.
+/// Key of a generated scene: hash of its parameters and of the program.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct SceneKey(String);
 
 impl SceneKey {
-    /// Returns the key of what `parts` describe, each in its place; `None` if this program cannot look at itself.
+    /// Returns the key for these parameters; their order matters. `None` if the program's own file cannot be read.
     pub(super) fn of(parts: &[&str]) -> Option<Self> {
         let program = std::env::current_exe().and_then(fs::metadata).ok()?;
         let build = format!("{} {} {}", program.len(), program.mtime(), program.mtime_nsec());
@@ -42,7 +42,7 @@ impl SceneKey {
 }
 
 impl KeptScenes {
-    /// Keeps scenes in `$XDG_CACHE_HOME/vizflyt/scenes`, or under `~/.cache`; `None` if neither is known.
+    /// Returns the user's cache: `$XDG_CACHE_HOME/vizflyt/scenes`, or under `~/.cache`. `None` if neither is known.
     pub(super) fn of_user() -> Option<Self> {
         let path =
             |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
@@ -50,10 +50,10 @@ impl KeptScenes {
         Some(Self { folder: caches.join("vizflyt/scenes"), max_bytes: MAX_BYTES })
     }
 
-    /// Returns the folder of a scene: as it is kept, else as `make` makes it, which is then kept.
+    /// Returns the folder of a scene. If it is not in the cache, `make` generates it.
     ///
     /// # Errors
-    /// What `make` says; a folder that cannot be written.
+    /// The error of `make`, or a folder that cannot be written.
     pub(super) fn get(
         &self,
         key: &SceneKey,
@@ -62,16 +62,16 @@ impl KeptScenes {
         let place = self.folder.join(&key.0);
         match is_whole(&place) {
             Ok(true) => {
-                // What was used last is thrown away last; a time that cannot be set costs a scene.
+                // The modification time orders the eviction. If it cannot be set, the scene is only evicted earlier.
                 let _ = File::open(&place).and_then(|file| file.set_modified(SystemTime::now()));
                 return Ok(place);
             }
-            Ok(false) => warn!("{} is damaged and is made anew", place.display()),
+            Ok(false) => warn!("{} is damaged and is generated again", place.display()),
             Err(_) => {}
         }
         fs::create_dir_all(&self.folder)
             .with_context(|| format!("cannot make {}", self.folder.display()))?;
-        // What is true of a scene is not for others on this computer.
+        // Other users of this computer must not read the true geometry.
         let mut aside = tempfile::Builder::new();
         let aside = aside.permissions(Permissions::from_mode(0o700)).tempdir_in(&self.folder);
         let aside =
@@ -83,7 +83,7 @@ impl KeptScenes {
         Ok(place)
     }
 
-    /// Throws away what was used longest ago while there is too much, but not `newest`.
+    /// Removes the least recently used scenes until the size limit is met, but never `newest`.
     fn shrink(&self, newest: &Path) {
         let Ok(entries) = fs::read_dir(&self.folder) else { return };
         let mut scenes: Vec<_> = entries
@@ -105,7 +105,7 @@ impl KeptScenes {
     }
 }
 
-/// Moves a scene to its place, over a damaged one; one that another start has put there meanwhile stays.
+/// Moves a scene to its place and replaces a damaged one. An intact scene that another process has put there stays.
 fn put(made: &Path, place: &Path) -> io::Result<()> {
     if fs::rename(made, place).is_ok() || is_whole(place).is_ok_and(|whole| whole) {
         return Ok(());
@@ -114,10 +114,10 @@ fn put(made: &Path, place: &Path) -> io::Result<()> {
     fs::rename(made, place)
 }
 
-/// Whether a scene is as it was made.
+/// Whether the scene matches its checksum.
 ///
 /// # Errors
-/// There is none.
+/// The scene does not exist.
 fn is_whole(scene: &Path) -> io::Result<bool> {
     fs::metadata(scene)?;
     let kept = fs::read_to_string(scene.join(CHECKSUM)).unwrap_or_default();
@@ -129,7 +129,7 @@ fn seal(scene: &Path) -> io::Result<()> {
     File::create_new(scene.join(CHECKSUM))?.write_all(sum.as_bytes())
 }
 
-/// Returns a hash of the names and the contents of all files but the checksum's own.
+/// Returns a hash of the names and contents of all files except the checksum file.
 fn checksum(scene: &Path) -> io::Result<String> {
     let paths = fs::read_dir(scene)?.map(|entry| entry.map(|entry| entry.path()));
     let mut paths = paths.collect::<io::Result<Vec<_>>>()?;
@@ -154,7 +154,7 @@ fn bytes_of(scene: &Path) -> u64 {
 }
 
 const CHECKSUM: &str = "checksum";
-/// Of some 10 MB each. [bytes]
+/// Maximum size of the cache; a scene has about 10 MB. [bytes]
 const MAX_BYTES: u64 = 256 << 20;
 
 #[cfg(test)]
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_is_made_once_and_is_for_its_owner_alone() {
+    fn generates_a_scene_once_with_owner_only_permissions() {
         let (_home, kept) = kept(1000);
         let first = kept.get(&key("forest 7"), write("forest")).unwrap();
         assert_eq!(kept.get(&key("forest 7"), none).unwrap(), first);
@@ -196,12 +196,12 @@ mod tests {
         let other = kept.get(&key("forest 8"), write("other")).unwrap();
         assert_eq!((text(&first), text(&other)), ("forest".to_owned(), "other".to_owned()));
         assert_ne!(SceneKey::of(&["a", "bc"]), SceneKey::of(&["ab", "c"]));
-        // Nothing is left of making them.
+        // No temporary folders remain.
         assert_eq!(fs::read_dir(&kept.folder).unwrap().count(), 2);
     }
 
     #[test]
-    fn a_damaged_scene_is_made_anew() {
+    fn regenerates_a_damaged_scene() {
         let (_home, kept) = kept(1000);
         let damages: [fn(&Path) -> io::Result<()>; 5] = [
             |scene| fs::write(scene.join("arena.toml"), "forst"),
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn what_another_start_has_put_there_meanwhile_stays() {
+    fn keeps_a_scene_that_another_process_stored_first() {
         let (_home, kept) = kept(1000);
         let scene = kept.get(&key("forest"), |folder| {
             kept.get(&key("forest"), write("theirs"))?;
@@ -231,8 +231,8 @@ mod tests {
     }
 
     #[test]
-    fn the_ones_used_longest_ago_go_when_there_are_too_many() {
-        // Each is 10 bytes and a checksum of 64.
+    fn evicts_the_least_recently_used_scenes() {
+        // Each scene has 10 bytes, and its checksum 64.
         let (_home, kept) = kept(3 * 74);
         let scenes = ["a", "b", "c"].map(|name| kept.get(&key(name), write("0123456789")).unwrap());
         for (scene, age_s) in scenes.iter().zip([300, 200, 100]) {
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_made_or_kept_is_an_error_and_leaves_nothing() {
+    fn failures_are_errors_and_leave_no_files() {
         let (home, kept) = kept(1000);
         let failed = kept.get(&key("forest"), |_| anyhow::bail!("no room"));
         assert_eq!(failed.unwrap_err().to_string(), "no room");

@@ -1,17 +1,17 @@
-//! Work on files: scenes, arenas, courses, data sets, trajectories, logs. Nothing here flies.
+//! Commands that work on files: scenes, arenas, courses, data sets, trajectories and logs. None of them flies.
 //!
 //! ```text
 //! scene      vizflyt scene: generate, capture, train, align, edit, carve, convert, bake, inspect, pack, render, view
-//! arena      vizflyt arena: make a room for a captured scene, set up its course, check it
-//! stage      what a simulated lab flies in: a generated scene on disk (kept for the next start), or the one at a path
-//! course     an instance of a project, from a seed, in memory
-//! dataset    vizflyt dataset: labelled images; labels: what each pixel of them shows
-//! evaluate   vizflyt evaluate: how far a trajectory is from the true one
+//! arena      vizflyt arena: create an arena for a captured scene, edit its course, check it
+//! stage      place of a simulated lab: a generated scene on disk (cached for the next start), or the one at a path
+//! course     an instance of a project, generated from a seed, in memory
+//! dataset    vizflyt dataset: labelled images; labels: contents of each of their pixels
+//! evaluate   vizflyt evaluate: error of an estimated trajectory
 //! export     vizflyt export: a flight's log as tables and images
 //! ```
-//! Each command is its arguments and one function that runs it; `vizflyt` only calls them.
+//! Each command consists of its arguments and one function that runs it. The program `vizflyt` only calls them.
 
-// `println!` panics where its reader has gone, as `head` does.
+// `println!` panics if its reader has closed the pipe, as `head` does.
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod arena;

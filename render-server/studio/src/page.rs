@@ -1,9 +1,9 @@
-//! How a page of an editor is shown.
+//! Output and browser start of an editor's page.
 
 use vizflyt_process::{open_browser, print_line};
 use vizflyt_server::render::RendererInfo;
 
-/// Returns what reports a page that answers: what draws it and its address; and opens it, if that is not to be `quiet`.
+/// Returns a callback that prints the renderer and the address of a page, and opens the browser unless `quiet`.
 pub(crate) fn show_page(quiet: bool) -> impl FnOnce(&str, &RendererInfo) {
     move |url, renderer| {
         print_line(format!("renderer    {} ({})", renderer.name, renderer.reason));

@@ -1,27 +1,27 @@
-//! A part of a long piece of work: `--shard 1/4` of flights or images, so that several computers share it.
+//! Shard of a long job: `--shard 1/4` of flights or images, to distribute it over several computers.
 
 use serde::{Deserialize, Serialize};
 
-/// As many parts as a grade has seeds, at most.
+/// Maximum number of shards: the maximum number of seeds of a grade.
 const MOST: u64 = 100_000;
 
-/// A part.
+/// One of several equal shares of a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Shard {
     /// From 1.
     pub index: u64,
-    /// How many there are.
+    /// Total number of shards.
     pub count: u64,
 }
 
 impl Shard {
-    /// Whether there is such a part.
+    /// Whether index and count are valid.
     pub fn is_one(index: u64, count: u64) -> bool {
         1 <= index && index <= count && count <= MOST
     }
 
-    /// Whether what is at this index of the order belongs to it.
+    /// Whether the item with this index (from 0) belongs to the shard.
     pub fn holds(self, index: usize) -> bool {
         index as u64 % self.count == self.index - 1
     }
@@ -35,6 +35,6 @@ impl std::str::FromStr for Shard {
             let (index, count) = (index.parse().ok()?, count.parse().ok()?);
             Self::is_one(index, count).then_some(Self { index, count })
         });
-        parts.ok_or_else(|| format!("{text:?} is no part; give 1/4 to 4/4 for four parts"))
+        parts.ok_or_else(|| format!("{text:?} is not a shard; give 1/4 to 4/4 for four shards"))
     }
 }

@@ -1,4 +1,4 @@
-//! Finds or makes what is flown in: an arena file, the spawn, and the truth if known.
+//! Finds or generates the place of a flight: arena file, spawn, and true geometry if known.
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt;
@@ -16,53 +16,54 @@ use vizflyt_tags::print::Pad;
 
 use crate::kept::{KeptScenes, SceneKey};
 
-/// What is to be flown in.
+/// Selection of the place of a flight.
 #[derive(Clone, Debug)]
 pub struct Place<'a> {
-    /// Name of a generated scene, or the path of a scene folder, an arena.toml or a scene file. With a project, its name.
+    /// Name of a generated scene, or the path of a scene folder, an arena.toml or a scene file. With a project, its
+    /// name.
     pub scene: &'a str,
-    /// A project of the course, with its place, sensors and rules.
+    /// Project of the course, with its place, sensors and rules.
     pub project: Option<CourseProject>,
-    /// The project's level.
+    /// Level of the project.
     pub level: Level,
-    /// The project's light and weather.
+    /// Light and weather of the project.
     pub variant: Variant,
-    /// Light and weather of a generated scene or of a scene file; none: as it is.
+    /// Light and weather of a generated scene or a scene file; `None`: unchanged.
     pub environment: Option<Variant>,
-    /// How a scene file lies in its room.
+    /// Placement of a scene file in its room.
     pub bare: BareArgs,
-    /// Seed of what is generated.
+    /// Seed of the generated place.
     pub seed: u64,
 }
 
 impl Place<'_> {
-    /// The seed where none is given.
+    /// Default seed.
     pub const SEED: u64 = 7;
 }
 
 /// A scene on disk, ready to be served.
 pub struct Stage {
-    /// What `vizflyt serve` is given: an `arena.toml`.
+    /// The `arena.toml` for `vizflyt serve`.
     pub arena: PathBuf,
-    /// True geometry, where the scene was generated.
+    /// File with the true geometry, if the scene was generated.
     pub truth: Option<PathBuf>,
-    /// The map that plugins may know, where it is known.
+    /// File with the map for plugins, if the course provides one.
     pub map: Option<PathBuf>,
-    /// Where the vehicle stands: `x,y,z,yaw_deg`. [m, world; deg]
+    /// Start pose of the vehicle: `x,y,z,yaw_deg`. [m, world; deg]
     pub spawn: String,
     /// Corners of the fence. [m, world]
     pub fence_m: (DVec3, DVec3),
-    /// Where it takes off, and where the flight ends.
+    /// Pads at the takeoff and at the goal.
     pub pads: Vec<Pad>,
-    /// Whether it depends on the seed.
+    /// Whether the place depends on the seed.
     is_generated: bool,
-    /// Holds files that were made for this flight alone until it ends.
+    /// Temporary files of this flight.
     #[expect(dead_code, reason = "dropped with the stage, which removes them")]
     folder: Option<TempDir>,
 }
 
 impl Stage {
-    /// Generates the project's place or the named scene, or takes the one at a path.
+    /// Generates the place of the project or the named scene, or uses the one at a path.
     pub fn prepare(place: &Place<'_>) -> Result<Self> {
         let scene = place.scene;
         if let Some(generate) = generator(place) {
@@ -77,7 +78,7 @@ impl Stage {
         let path = Path::new(scene);
         if !path.exists() {
             bail!(
-                "--scene '{scene}' is no generated scene ({}) and no path that exists; give one of the \
+                "--scene '{scene}' is neither a generated scene ({}) nor an existing path; give one of the \
                  names, a folder with an arena.toml, or a scene file",
                 SceneKind::names()
             );
@@ -98,7 +99,7 @@ impl Stage {
         Self::around(path, place)
     }
 
-    /// Makes up an arena around a scene file, and writes it down: what is guessed is guessed once.
+    /// Creates a default arena for a scene file and writes it to a file, so that all processes use the same guesses.
     fn around(scene: &Path, place: &Place<'_>) -> Result<Self> {
         let mut arena = vizflyt_server::scene::load(scene, &place.bare)?.arena;
         let file =
@@ -114,7 +115,7 @@ impl Stage {
         Self::at(path, Some(folder))
     }
 
-    /// Returns what the seed changed, to be printed behind its name.
+    /// Returns the suffix with the seed for printing; empty if the place does not depend on it.
     pub fn seeded(&self, seed: u64) -> String {
         if self.is_generated { format!(", seed {seed}") } else { String::new() }
     }
@@ -131,7 +132,7 @@ impl Stage {
     }
 }
 
-/// Returns what makes the lab's place, if it is a generated one.
+/// Returns the generator of the place, or `None` if it is a path.
 fn generator<'a>(place: &'a Place<'_>) -> Option<Box<dyn Fn() -> Generated + 'a>> {
     if let Some(project) = &place.project {
         return Some(Box::new(move || project.generate(place.seed, place.level, place.variant)));
@@ -146,8 +147,8 @@ fn generator<'a>(place: &'a Place<'_>) -> Option<Box<dyn Fn() -> Generated + 'a>
     }))
 }
 
-/// Returns the folder of a generated place, kept from an earlier start or generated now; and what removes it, if it is
-/// for this flight alone.
+/// Returns the folder of a generated place, from the cache or generated now. If it could not be cached, also returns
+/// the guard that removes the folder after the flight.
 fn generated_folder(
     place: &Place<'_>,
     generate: impl Fn() -> Generated,
@@ -173,7 +174,7 @@ fn generated_folder(
 fn folder() -> Result<TempDir> {
     tempfile::Builder::new()
         .prefix("vizflyt-lab-")
-        // What is true of it is not for others on this computer.
+        // Other users of this computer must not read the true geometry.
         .permissions(Permissions::from_mode(0o700))
         .tempdir()
         .context("cannot make a folder for the scene")
@@ -183,7 +184,8 @@ fn fence_m(arena: &ArenaConfig) -> (DVec3, DVec3) {
     (arena.geofence.min_m, arena.geofence.max_m)
 }
 
-/// Returns where a mat needs pads: at the spawn, and as long as the goal is wide, for a vehicle brakes in it.
+/// Returns the pads that a mat needs: one at the spawn, and one as long as the goal is wide, because the vehicle brakes
+/// in the goal.
 fn pads(arena: &ArenaConfig) -> Vec<Pad> {
     let start = Pad { middle_m: arena.spawn.position_m.truncate(), size_m: Pad::SIZE_M };
     let end = arena.goal.as_ref().map(|goal| Pad {
@@ -193,7 +195,7 @@ fn pads(arena: &ArenaConfig) -> Vec<Pad> {
     std::iter::once(start).chain(end).collect()
 }
 
-/// Returns where the vehicle stands, as `vizflyt sim --spawn` reads it.
+/// Returns the start pose in the format of `vizflyt sim --spawn`.
 fn spawn(arena: &ArenaConfig) -> String {
     let p = arena.spawn.position_m;
     format!("{},{},{},{}", p.x, p.y, p.z, arena.spawn.yaw_deg)

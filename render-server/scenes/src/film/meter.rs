@@ -1,29 +1,30 @@
-//! The automatic exposure: how bright the image is to be, by which shutter and ISO, and with which lag.
+//! Automatic exposure: gain, shutter and ISO from the light of the image, with the lag of a phone.
 
 use vizflyt_splat::imaging::exposure::Follow;
 
 use super::phone::LEAST_ISO;
 use super::{Band, BandImage, Phone};
 
-/// How one image is exposed.
+/// Exposure of an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exposure {
-    /// What linear light is multiplied by before the tone curve.
+    /// Factor on linear light before the tone curve.
     pub gain: f64,
-    /// How long each row is exposed. [s]
+    /// Exposure time of each row. [s]
     pub shutter_s: f64,
-    /// The sensor's gain.
+    /// Gain of the sensor.
     pub iso: f64,
 }
 
-/// Follows the light.
+/// Automatic exposure control.
 #[derive(Clone, Debug, Default)]
 pub struct Meter {
     gain: Follow,
 }
 
 impl Meter {
-    /// Returns the exposure of an image `dt_s` after the last one, by what its bands see; the first is exposed right.
+    /// Returns the exposure of an image `dt_s` after the last one, from the light of its bands. The first image has the
+    /// exact exposure.
     pub fn next(
         &mut self,
         phone: &Phone,
@@ -37,17 +38,17 @@ impl Meter {
 }
 
 impl Exposure {
-    /// Returns how a phone exposes for a gain: with the longest shutter that does not flicker under lamps, and the ISO that it
-    /// needs; in bright light with the least ISO and a shorter shutter.
+    /// Returns the exposure of a phone for a gain: the longest shutter without flicker under lamps, and the ISO for it.
+    /// In bright light, it uses the minimum ISO and a shorter shutter.
     pub fn of(phone: &Phone, gain: f64) -> Self {
-        // Incident light: N^2 / t = E S / C (ISO 2720:1974, annex), of what shows as it is.
+        // Incident light: N^2 / t = E S / C (ISO 2720:1974, annex), at gain 1.
         let iso_s = gain * F_NUMBER * F_NUMBER * INCIDENT / phone.illuminance_lx;
         let iso = (iso_s / LONGEST_S).clamp(LEAST_ISO, MOST_ISO);
         Self { gain, shutter_s: (iso_s / iso).min(LONGEST_S), iso }
     }
 }
 
-/// Mean light of an image, the middle counting more, as phones do.
+/// Returns the centre-weighted mean light of an image, as phones measure it.
 fn mean_light(bands: &[Band], images: &[BandImage]) -> f64 {
     let (mut sum, mut weights) = (0.0, 0.0);
     let height = bands.last().map_or(1, |band| band.rows.end);
@@ -70,19 +71,19 @@ fn mean_light(bands: &[Band], images: &[BandImage]) -> f64 {
     if weights > 0.0 { sum / weights } else { AIM }
 }
 
-/// Mean linear light that is aimed at: a grey card's 18 % and half as much again, as phones show rooms with windows.
+/// Target for the mean linear light: 1.5 times the 18 % of a grey card, as phones show rooms with windows.
 const AIM: f64 = 0.27;
-/// Least and greatest gain.
+/// Minimum and maximum gain.
 const LEAST: f64 = 0.35;
 const MOST: f64 = 3.0;
-/// How slowly it follows: a phone's exposure settles within about a second. [s]
+/// Time constant of the control: a phone's exposure settles within about a second. [s]
 const LAG_S: f64 = 0.35;
-/// Of phones' main cameras.
+/// F-number of phones' main cameras.
 const F_NUMBER: f64 = 1.8;
-/// The constant of incident light meters.
+/// Calibration constant C of incident light meters.
 const INCIDENT: f64 = 250.0;
-/// A hundredth: lamps flicker at 100 Hz or are not seen to. [s]
+/// Maximum exposure time: one period of lamps that flicker at 100 Hz. [s]
 const LONGEST_S: f64 = 0.01;
 const MOST_ISO: f64 = 1600.0;
-/// Every so many pixels are looked at.
+/// Distance between the measured pixels. [px]
 const STRIDE: usize = 8;

@@ -1,5 +1,5 @@
-//! The film against what is plain and slow: every row rendered at every instant of its exposure; and the sensor against its
-//! model.
+//! Compares images with a slow reference, which renders each row at several times of its exposure, and the sensor with
+//! its noise model.
 
 use glam::{DQuat, DVec3};
 use vizflyt_splat::{CpuRenderer, Rasterizer};
@@ -30,14 +30,14 @@ fn shoot(
     bands.collect()
 }
 
-/// Peak signal-to-noise ratio of bytes. [dB]
+/// Returns the peak signal-to-noise ratio of bytes. [dB]
 fn alike_db(a: &[u8], b: &[u8]) -> f64 {
     let sum: f64 = a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
     10.0 * libm::log10(255.0 * 255.0 * a.len() as f64 / sum.max(1e-9))
 }
 
 #[test]
-fn a_phone_that_stands_still_shows_what_is_rendered() {
+fn a_static_phone_records_the_rendered_image() {
     let set = film_set(SceneKind::Room, 3, 20.0, false).unwrap();
     let mut renderer = CpuRenderer::new(&set.scene.splats);
     let film = Film::new(phone(160, 120));
@@ -49,12 +49,12 @@ fn a_phone_that_stands_still_shows_what_is_rendered() {
     renderer.render(&[], &[camera], &mut images).unwrap();
     let mut plain = Vec::new();
     images[0].write_rgb8(&mut plain);
-    // But for rounding, and for the last splats that a band's larger image shows.
+    // They differ by rounding, and by splats at the border of a band's larger image.
     let db = alike_db(&filmed, &plain);
     assert!(db > 48.0, "{db} dB");
 }
 
-/// Each row is the mean of renderings at eight instants of its own exposure.
+/// Reference image: each row is the mean of renderings at eight times of its exposure.
 fn brute_force(
     film: &Film,
     renderer: &mut CpuRenderer,
@@ -70,7 +70,7 @@ fn brute_force(
         for n in 0..8 {
             let row_s = film.phone().row_instant_s(f64::from(row) + 0.5, middle_s);
             let at_s = row_s + shutter_s * ((f64::from(n) + 0.5) / 8.0 - 0.5);
-            // This row alone, of a camera one row high.
+            // Render only this row, with a camera of one row.
             let one = Intrinsics { height_px: 1, cy_px: k.cy_px - f64::from(row), ..k };
             let camera = Camera::new(one, track(at_s), NEAR_M);
             renderer.render(&[], &[camera], &mut images).unwrap();
@@ -84,13 +84,14 @@ fn brute_force(
 }
 
 #[test]
-fn rows_and_blur_are_those_of_every_instant_rendered() {
+fn rolling_shutter_and_blur_match_the_reference() {
     for kind in [SceneKind::Room, SceneKind::Forest] {
         let set = film_set(kind, 3, 20.0, false).unwrap();
         let mut renderer = CpuRenderer::new(&set.scene.splats);
         let film = Film::new(phone(160, 120));
         let track = |at_s: f64| {
-            // A turn of 50 degrees a second on top of the walk: 9 px of shear, 4 of blur in 160.
+            // A rotation of 50 degrees per second in addition to the walk: 9 px of shear, 4 px of blur at a width of
+            // 160.
             let pose = set.walk.world_from_cam(at_s);
             let turn = DQuat::from_rotation_z(0.87 * (at_s - 6.0));
             Pose::new(pose.translation_m, turn * pose.rotation)
@@ -99,7 +100,7 @@ fn rows_and_blur_are_those_of_every_instant_rendered() {
         let filmed = film.develop(&bands, &track, 6.0, &STILL, 1);
         let plain = brute_force(&film, &mut renderer, &track, 6.0, STILL.shutter_s);
         let db = alike_db(&filmed, &plain);
-        // What a still image from the middle would be.
+        // For comparison: an image without motion.
         let still = |_| track(6.0);
         let bands = shoot(&film, &mut renderer, &still, 6.0);
         let unmoved_db = alike_db(&film.develop(&bands, &still, 6.0, &STILL, 1), &plain);
@@ -107,16 +108,16 @@ fn rows_and_blur_are_those_of_every_instant_rendered() {
     }
 }
 
-/// Known solids are where the pose of each row says: a corner of a block, seen through lens and shutter.
+/// The edge of a known surface must be at the position that each row's pose predicts, with lens and shutter.
 #[test]
-fn known_edges_are_where_their_rows_pose_puts_them() {
-    // A white block on black ground: depth as of a wall 2 m ahead, light on the right of x = 0.1 m in the world's plane.
+fn edges_match_the_pose_of_their_row() {
+    // A wall 2 m ahead, white for x > 0.1 m and black otherwise.
     let film = Film::new(phone(640, 480));
     let track = |at_s: f64| {
         let turn = DQuat::from_rotation_y(0.9 * at_s) * DQuat::from_rotation_x(-0.3 * at_s);
         Pose::new(DVec3::new(0.4 * at_s, 0.1 * at_s, 0.0), turn)
     };
-    // The world's z is ahead here: one wall at z = 2, bright beyond x = 0.1.
+    // Here, the world's z axis points forward: a wall at z = 2, bright beyond x = 0.1.
     let bands: Vec<BandImage> = film
         .bands()
         .iter()
@@ -130,7 +131,7 @@ fn known_edges_are_where_their_rows_pose_puts_them() {
                     let ray = world_from_cam.rotate(k.slope(pixel).unwrap().extend(1.0));
                     let eye = world_from_cam.translation_m;
                     let depth_m = (2.0 - eye.z) / ray.z;
-                    // Over the pixel's width the edge is a ramp.
+                    // The edge is a ramp over the width of a pixel.
                     let width_m = depth_m / k.fx_px;
                     let beyond = ((eye + ray * depth_m).x - 0.1) / width_m + 0.5;
                     image.light.extend([beyond.clamp(0.0, 1.0) as f32; 3]);
@@ -144,7 +145,7 @@ fn known_edges_are_where_their_rows_pose_puts_them() {
     let k = film.phone().intrinsics;
     let mut worst_px = 0f64;
     for y in (4..476).step_by(9) {
-        // The edge is where a row's light, summed, has its step.
+        // Position of the edge from the sum of dark pixels in the row.
         let row = &filmed[3 * 640 * y..][..3 * 640];
         let dark: f64 = row
             .chunks_exact(3)
@@ -152,7 +153,7 @@ fn known_edges_are_where_their_rows_pose_puts_them() {
             .sum();
         let row_s = film.phone().row_instant_s(y as f64 + 0.5, 0.0);
         let cam_from_world = track(row_s).inverse();
-        // The point of the edge that this row sees, by halving its height.
+        // Find the point of the edge in this row by bisection over its height.
         let (mut low, mut high) = (-2.0, 2.0);
         for _ in 0..60 {
             let middle = f64::midpoint(low, high);
@@ -166,7 +167,7 @@ fn known_edges_are_where_their_rows_pose_puts_them() {
 }
 
 #[test]
-fn noise_is_as_stated_and_another_in_each_image() {
+fn noise_matches_its_model_and_differs_between_images() {
     let film = Film::new(phone(320, 240));
     let pose = |_| Pose::IDENTITY;
     for (iso, light) in [(100.0, 0.2), (400.0, 0.2), (400.0, 0.02), (1600.0, 0.5)] {
@@ -189,7 +190,7 @@ fn noise_is_as_stated_and_another_in_each_image() {
         let variance = linear.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / linear.len() as f64;
         let (shot, read) = film.phone().noise(iso);
         let expected = (shot * f64::from(light) + read).sqrt();
-        // Of eight bits a step is up to 0.004 of linear light there.
+        // One step of eight bits is up to 0.004 of linear light in this range.
         assert!((mean - f64::from(light)).abs() < 0.002, "ISO {iso}: mean {mean}");
         let found = variance.sqrt();
         assert!(
@@ -200,7 +201,7 @@ fn noise_is_as_stated_and_another_in_each_image() {
 }
 
 #[test]
-fn exposure_follows_the_light_with_a_phones_lag() {
+fn exposure_follows_the_light_with_a_lag() {
     let phone = phone(160, 120);
     let film = Film::new(phone);
     let lit = |light: f32| -> Vec<BandImage> {
@@ -218,7 +219,7 @@ fn exposure_follows_the_light_with_a_phones_lag() {
     let settled =
         (0..60).fold(next, |_, _| meter.next(&phone, film.bands(), &lit(0.4), 1.0 / 30.0));
     assert!((settled.gain - first.gain / 2.0).abs() < 0.02, "{settled:?}");
-    // In a lit room a hundredth of a second and some hundred ISO; in the sun the shutter is short.
+    // In a lit room: 1/100 s and some hundred ISO. In the sun: a short shutter.
     assert!(first.shutter_s == 0.01 && (100.0..800.0).contains(&first.iso), "{first:?}");
     let outside = Phone { illuminance_lx: 50_000.0, ..phone };
     let sun = Exposure::of(&outside, 1.0);

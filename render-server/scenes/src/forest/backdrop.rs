@@ -1,5 +1,5 @@
-//! What lies beyond: a sky that is brightest about the sun, hazy hills, and belts of distant
-//! trunks and foliage that fade into the haze.
+//! Distant surroundings: a sky that is brightest around the sun, hazy hills, and belts of distant trunks and foliage
+//! that fade into the haze.
 
 use core::f64::consts::{PI, TAU};
 
@@ -13,7 +13,7 @@ use crate::random::{Rng, fractal2, polar, smoothstep};
 pub(crate) fn paint_backdrop(canvas: &mut Canvas, site: &Site) {
     let mut rng = Rng::new(site.seed, 5);
     paint_sky(canvas, &mut rng, site);
-    // (distance beyond the middle ellipse, haze, splat size)
+    // (Distance beyond the middle ellipse, haze, splat size).
     for (away_m, haze, size_m) in [(11.0, 0.16, 0.9), (17.0, 0.5, 1.4)] {
         paint_belt(canvas, &mut rng, site, away_m, haze, size_m);
     }
@@ -76,11 +76,11 @@ fn paint_belt(
         let towards = (p - MIDDLE_M.truncate())
             .normalize_or_zero()
             .dot(site.sun.truncate().normalize_or_zero());
-        // Against the sun the haze is bright and golden; away from it cool.
+        // The haze is bright and golden towards the sun, and cool away from it.
         HAZE.lerp(DVec3::new(1.25, 1.0, 0.66), 0.6 * towards.max(0.0))
     };
     let key = site.seed ^ (away_m as u64);
-    // Foliage: a bank whose top rises and falls.
+    // Foliage with a varying height.
     let columns = (perimeter_m / size_m) as usize;
     for column in 0..columns {
         let angle = TAU * (column as f64 + rng.spread(0.5)) / columns as f64;
@@ -106,7 +106,7 @@ fn paint_belt(
             z_m += 0.85 * size_m * rng.range(0.8, 1.2);
         }
     }
-    // Trunks in front of it.
+    // Trunks in front of the foliage.
     for _ in 0..(perimeter_m / 1.3) as usize {
         let p = place(rng.angle()) + polar(rng.angle()) * 1.2;
         let p = p + (MIDDLE_M.truncate() - p).normalize_or_zero() * 1.6;
@@ -133,7 +133,6 @@ fn paint_belt(
 const HAZE: DVec3 = DVec3::new(0.62, 0.72, 0.62);
 /// Middle of the arena, on the ground. [m, world]
 const MIDDLE_M: DVec3 = DVec3::new(20.0, 0.0, 0.0);
-/// The sky's half axes: its far end stays within 65 m of the arena, the reach of 16-bit
-/// millimetres. [m]
+/// Half axes of the sky. Its far end is within 65 m of the arena, the limit of 16-bit millimetres. [m]
 const SKY_X_M: f64 = 43.0;
 const SKY_Z_M: f64 = 34.0;

@@ -31,7 +31,7 @@ pub(crate) fn paint_wood(canvas: &mut Canvas, site: &Site, light: &Light) {
 
 /// Returns the albedo and the relief [m] of bark: `around` is the direction from the axis.
 fn bark(species: Species, key: u64, around: DVec3, radius_m: f64, z_m: f64) -> (DVec3, f64) {
-    // Wrapped onto a circle, so that there is no seam; 1 unit is 1 m of circumference.
+    // The noise is wrapped onto a circle, so that there is no seam; 1 unit is 1 m of circumference.
     let on = |across_m: f64, along_m: f64| {
         DVec3::new(around.x * radius_m / across_m, around.y * radius_m / across_m, z_m / along_m)
     };
@@ -70,7 +70,7 @@ fn bark(species: Species, key: u64, around: DVec3, radius_m: f64, z_m: f64) -> (
     }
 }
 
-/// Adds moss: on the side away from the sun and at the feet.
+/// Adds moss on the side away from the sun and at the base.
 fn moss(key: u64, light: &Light, p_m: DVec3, normal: DVec3, albedo: DVec3, rng: &mut Rng) -> DVec3 {
     let away = -normal.truncate().dot(light.sun.truncate().normalize_or_zero());
     let patch = noise(key ^ 0x14, p_m / 0.3) + 0.4 * noise(key ^ 0x15, p_m / 0.08) - 0.2;
@@ -87,7 +87,7 @@ fn paint_trunk(canvas: &mut Canvas, rng: &mut Rng, tree: &Tree, light: &Light) {
     let mut z_m = 0.02;
     while z_m < tree.top_m() - 0.2 {
         let (_, radius_m) = tree.at_height(z_m);
-        // (across, along) the patch spacing: fine where vehicles pass, coarse in the crown.
+        // Patch spacing (across, along): fine where vehicles pass, coarse in the crown.
         let (across_m, along_m) = match (distant, z_m) {
             (false, z) if z < 3.0 && !aside => (0.046, 0.17),
             (false, z) if z < 3.2 => (0.052, 0.19),
@@ -109,7 +109,7 @@ fn paint_trunk(canvas: &mut Canvas, rng: &mut Rng, tree: &Tree, light: &Light) {
             }
             let (albedo, relief_m) = bark(tree.species, tree.key, around, radius_m, z);
             let albedo = moss(tree.key, light, p_m, normal, albedo, rng);
-            // Furrows see less of the sky; ridges tilt the surface at random.
+            // Furrows receive less light; ridges tilt the surface randomly.
             let tilted = (normal + rng.direction() * 0.22).normalize_or(normal);
             let crevice = 1.0 - 18.0 * relief_m;
             let grain = (0.13 * rng.normal()).clamp(-0.3, 0.3) + 1.0;
@@ -129,12 +129,11 @@ fn paint_trunk(canvas: &mut Canvas, rng: &mut Rng, tree: &Tree, light: &Light) {
     }
 }
 
-/// Lays narrow strokes over the trunk where vehicles pass: what a camera resolves at an arm's
-/// length.
+/// Paints narrow strokes on the trunk where vehicles pass: details that a camera resolves at a distance of about 0.7 m.
 fn paint_strokes(canvas: &mut Canvas, rng: &mut Rng, tree: &Tree, light: &Light) {
     let (_, radius_m) = tree.at_height(1.5);
     let count = (TAU * radius_m * STROKES_TOP_M * STROKES_PER_M2) as usize;
-    // Birch bark is marked across, the others along.
+    // Birch bark has horizontal marks, the others vertical ones.
     let across = tree.species == Species::Birch;
     for _ in 0..count {
         let around = polar(rng.angle()).extend(0.0);
@@ -166,7 +165,7 @@ fn paint_strokes(canvas: &mut Canvas, rng: &mut Rng, tree: &Tree, light: &Light)
     }
 }
 
-/// Returns the surface point met from outside towards the axis, and its normal. [m, world]
+/// Returns the surface point of a ray from outside towards the axis, and its normal. [m, world]
 fn surface(parts: &[Volume], center_m: DVec3, around: DVec3) -> Option<(DVec3, DVec3)> {
     let distance = |p: DVec3| parts.iter().map(|v| v.signed_distance_m(p)).fold(f64::MAX, f64::min);
     let mut p_m = center_m + around * 0.75;
@@ -252,7 +251,7 @@ fn paint_log(canvas: &mut Canvas, rng: &mut Rng, log: &Limb, light: &Light) {
     let side = along.cross(DVec3::Z).normalize_or(DVec3::X);
     let other = side.cross(along);
     let key = (length_m * 1e6) as u64;
-    // Along the barrel, then over both round ends.
+    // The cylinder and both round ends.
     let (across_m, step_m) = (0.04, 0.075);
     let columns = (TAU * log.radius_m / across_m).ceil() as usize;
     let end = log.radius_m;
@@ -285,7 +284,7 @@ fn paint_log(canvas: &mut Canvas, rng: &mut Rng, log: &Limb, light: &Light) {
     }
 }
 
-/// Strokes per square metre of bark: the budget of splats over some thirty near trees.
+/// Strokes per square metre of bark, from the budget of splats and about thirty near trees.
 const STROKES_PER_M2: f64 = 130.0;
-/// Strokes are laid up to this height. [m, world]
+/// Maximum height of strokes. [m, world]
 const STROKES_TOP_M: f64 = 3.0;

@@ -1,7 +1,6 @@
-//! The forest floor: a trodden path, soil, moss and leaf litter, boulders and twigs.
+//! Forest floor: a trodden path, soil, moss and leaf litter, boulders and twigs.
 //!
-//! The true floor is the plane z = 0; patches lie one to three centimetres below it, and litter
-//! stands up at most two above.
+//! The true floor is the plane z = 0. Patches lie 1 to 3 cm below it, and litter is at most 2 cm above it.
 
 use glam::{DVec2, DVec3};
 
@@ -10,18 +9,18 @@ use super::site::{Rock, Site};
 use crate::canvas::{Canvas, Patch, paint};
 use crate::random::{Rng, fractal2, noise, noise2, polar, smoothstep};
 
-/// What covers the ground at a point.
+/// Ground cover at a point.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Cover {
-    /// How trodden it is, 0 to 1.
+    /// Share of trodden path, 0 to 1.
     pub(crate) path: f64,
-    /// How mossy or grassy it is, 0 to 1.
+    /// Share of moss or grass, 0 to 1.
     pub(crate) green: f64,
-    /// How much litter lies there, 0 to 1.
+    /// Share of litter, 0 to 1.
     pub(crate) litter: f64,
 }
 
-/// Returns what covers the ground at a point. [m, world]
+/// Returns the ground cover at a point. [m, world]
 pub(crate) fn cover(seed: u64, p: DVec2) -> Cover {
     let centre_m = 1.5 * (noise2(seed ^ 0x29, DVec2::new(p.x / 9.0, 0.0)) - 0.5)
         + 0.5 * (noise2(seed ^ 0x2a, DVec2::new(p.x / 3.0, 4.0)) - 0.5);
@@ -32,7 +31,7 @@ pub(crate) fn cover(seed: u64, p: DVec2) -> Cover {
     Cover { path, green, litter }
 }
 
-/// Paints the floor, what lies on it, and the boulders.
+/// Paints the floor, litter and boulders.
 pub(crate) fn paint_ground(canvas: &mut Canvas, site: &Site, light: &Light) {
     let mut rng = Rng::new(site.seed, 3);
     paint_bed(canvas, &mut rng, site, light);
@@ -83,8 +82,8 @@ fn add_ground(
     let stretch = rng.range(1.0, 1.35);
     let surface_m = p.extend(0.0);
     canvas.add(Patch {
-        // At a grazing angle a pixel takes the depth of the nearest patch that covers it: two
-        // centimetres down, the floor is seen where it is.
+        // At a grazing angle, a pixel has the depth of the nearest patch that covers it. With patches 2 cm below, the
+        // rendered floor is at its true height.
         center_m: p.extend(-rng.range(0.022, 0.032)),
         normal,
         along: polar(rng.angle()).extend(0.0),
@@ -94,8 +93,8 @@ fn add_ground(
     });
 }
 
-/// Large patches well below the floor, which close the seams between the fine ones. They lie so
-/// deep that on any line of sight from above they come after the floor, and never blur it.
+/// Paints large patches well below the floor, which close the seams between the fine ones. They are so deep that they
+/// are behind the floor on any line of sight from above, and never blur it.
 fn paint_bed(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     let side_m = 0.46;
     let columns = ((FAR_X_M - NEAR_X_M) / side_m) as usize;
@@ -121,7 +120,7 @@ fn paint_bed(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     }
 }
 
-/// The arena and a little beyond, finest along its middle.
+/// Paints the arena and its border, finest along its middle.
 fn paint_near(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     for side in [-1.0, 1.0] {
         let mut y = 0.0;
@@ -139,7 +138,7 @@ fn paint_near(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     }
 }
 
-/// What surrounds it, out to the horizon: squares that grow with distance.
+/// Paints the surroundings up to the horizon, with squares that grow with distance.
 fn paint_far(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     let mut open = Vec::new();
     for i in -5..5 {
@@ -167,12 +166,12 @@ fn paint_far(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     }
 }
 
-/// Fallen leaves and twigs that catch the light; denser near the middle.
+/// Paints fallen leaves and twigs, denser near the middle.
 fn paint_litter(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     let mut leaves = 0;
     while leaves < 5200 {
         let p = DVec2::new(rng.range(-2.0, 42.0), 2.1 * rng.normal());
-        // Where the vehicle stands and lands the floor is bare.
+        // The floor is bare at start and goal.
         if p.y.abs() > 7.0
             || site.is_near_ends(p, 0.7)
             || !rng.chance(0.12 + 0.88 * cover(site.seed, p).litter)
@@ -217,7 +216,7 @@ fn paint_rock(canvas: &mut Canvas, rng: &mut Rng, rock: &Rock, key: u64, light: 
     let area_m2 = 4.0 * core::f64::consts::PI * rock.radius_m * rock.radius_m;
     let count = (area_m2 / (spacing_m * spacing_m)) as usize;
     for n in 0..count {
-        // Fibonacci sphere: even, and cheap to jitter.
+        // Fibonacci sphere: even, and easy to jitter.
         let z = 1.0 - 2.0 * (n as f64 + 0.5) / count as f64;
         let turn = n as f64 * 2.399_963_229_728_653;
         let ring = (1.0 - z * z).max(0.0).sqrt();

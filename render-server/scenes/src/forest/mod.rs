@@ -1,8 +1,7 @@
-//! The forest: 40 m of trunks between start and goal.
+//! Forest: 40 m of trunks between start and goal.
 //!
-//! Data flow: [`site`] plans what stands where and its true shapes; [`light`] answers how much
-//! light arrives at a point; [`ground`], [`bark`], [`plants`] and [`backdrop`] lay patches on the
-//! true surfaces, lit by it.
+//! Data flow: [`site`] plans all objects and their true shapes. [`light`] computes the light at a point. [`ground`],
+//! [`bark`], [`plants`] and [`backdrop`] paint lit patches on the true surfaces.
 
 mod backdrop;
 mod bark;
@@ -32,7 +31,7 @@ pub(crate) fn build(seed: u64) -> Generated {
     build_staged(seed, &mut Staging::none())
 }
 
-/// Returns the forest of a seed, made to be filmed.
+/// Returns the forest of a seed, staged for a capture.
 pub(crate) fn build_staged(seed: u64, staging: &mut Staging) -> Generated {
     let layers: [Layer; 3] = [
         (PartClass::Ground, ground::paint_ground),
@@ -42,7 +41,7 @@ pub(crate) fn build_staged(seed: u64, staging: &mut Staging) -> Generated {
     build_layers(seed, &layers, staging)
 }
 
-/// Returns the forest without leaves, ferns and grass: what is solid only.
+/// Returns the forest with only its solid parts: without leaves, ferns and grass.
 #[cfg(test)]
 pub(crate) fn build_bare(seed: u64) -> Generated {
     let layers: [Layer; 2] =
@@ -50,7 +49,7 @@ pub(crate) fn build_bare(seed: u64) -> Generated {
     build_layers(seed, &layers, &mut Staging::none())
 }
 
-/// What a painter paints, and the painter.
+/// Class of the painted parts, and the function that paints them.
 type Layer = (PartClass, fn(&mut Canvas, &Site, &Light));
 
 fn build_layers(seed: u64, layers: &[Layer], staging: &mut Staging) -> Generated {
@@ -59,7 +58,7 @@ fn build_layers(seed: u64, layers: &[Layer], staging: &mut Staging) -> Generated
     let mut truth = site.truth();
     let stage = Stage {
         fence: &arena.geofence,
-        // Outside of the fence the forest is painted coarsely.
+        // The forest is painted coarsely outside of the fence.
         around_m: -0.6,
         walls: &[],
         movers: &[],
@@ -123,7 +122,7 @@ fn arena(site: &Site) -> ArenaConfig {
     }
 }
 
-/// Returns the camera every generated arena has: 320x240, 90 degrees across, in the nose.
+/// Returns the camera of all generated arenas: 320x240, horizontal field of view of 90 degrees, in the nose.
 pub(crate) fn front_camera() -> CameraConfig {
     CameraConfig::ahead("front", [320, 240], 90.0, DVec3::new(0.06, 0.0, 0.02))
 }

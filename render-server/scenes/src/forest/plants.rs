@@ -1,7 +1,7 @@
-//! Crowns, bushes, ferns and grass: clumps of single leaves.
+//! Crowns, bushes, ferns and grass, made of single leaves.
 //!
-//! Crowns stay above [`CROWN_FLOOR_M`] within the fence; ferns and grass are soft and stay below
-//! 0.4 m; bushes stand outside the fence.
+//! Within the fence, crowns are above [`CROWN_FLOOR_M`]. Ferns and grass are not solid and are below 0.4 m. Bushes are
+//! outside of the fence.
 
 use glam::{DVec2, DVec3};
 
@@ -20,13 +20,13 @@ pub(crate) fn paint_plants(canvas: &mut Canvas, site: &Site, light: &Light) {
     paint_grass(canvas, &mut rng, site, light);
 }
 
-/// A ball of leaves.
+/// Spherical clump of leaves.
 struct Clump {
     center_m: DVec3,
     radius_m: f64,
     leaves: usize,
     leaf_m: f64,
-    /// Least height of a leaf's lowest point. [m]
+    /// Minimum height of leaves. [m]
     floor_m: f64,
     dark: DVec3,
     bright: DVec3,
@@ -34,7 +34,7 @@ struct Clump {
 
 fn paint_clump(canvas: &mut Canvas, rng: &mut Rng, clump: &Clump, light: &Light) {
     for _ in 0..clump.leaves {
-        // More leaves near the surface of the ball than within.
+        // More leaves near the surface of the clump than inside.
         let out = rng.direction();
         let reach = libm::cbrt(rng.range(0.12, 1.0));
         let offset = DVec3::new(out.x, out.y, out.z * 0.72) * reach;
@@ -42,7 +42,7 @@ fn paint_clump(canvas: &mut Canvas, rng: &mut Rng, clump: &Clump, light: &Light)
         let mut p_m = clump.center_m + offset * clump.radius_m;
         p_m.z = p_m.z.max(clump.floor_m + 2.2 * size_m);
         let normal = (offset * 0.9 + DVec3::Z * 0.5 + rng.direction() * 0.9).normalize_or(DVec3::Z);
-        // Sun that reaches this leaf through its own clump.
+        // Sun that reaches this leaf through its clump.
         let depth = offset.dot(light.sun);
         let shade = smoothstep(-0.9, 0.75, depth + 0.3 * offset.z) * 0.9 + 0.08;
         let albedo = clump.dark.lerp(clump.bright, rng.unit()) * (0.72 + 0.4 * reach);
@@ -95,7 +95,7 @@ fn paint_crowns(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) 
     }
 }
 
-/// A belt of bushes and young trees round the fence, so that the eye meets green on every side.
+/// Paints a belt of bushes and young trees around the fence, so that all views end in green.
 fn paint_bushes(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     let mut placed = 0;
     while placed < 250 {
@@ -104,7 +104,7 @@ fn paint_bushes(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) 
         if !(1.5..9.5).contains(&out_m) {
             continue;
         }
-        // In groups, with views between them; a thicket farther out.
+        // In groups with gaps between them, denser farther out.
         let group = noise2(site.seed ^ 0x3d, p / 3.0);
         if group < 0.56 - 0.04 * out_m {
             continue;
@@ -147,7 +147,7 @@ fn paint_ferns(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
             let angle = turn + core::f64::consts::TAU * frond as f64 / fronds as f64;
             let out = polar(angle + rng.spread(0.3));
             let reach_m = size_m * rng.range(0.8, 1.2);
-            // An arch: up, then over.
+            // Each frond is an arch.
             for n in 1..=5 {
                 let t = f64::from(n) / 5.0;
                 let rise = (1.9 * t - 1.45 * t * t) * size_m * 1.25;
@@ -199,5 +199,5 @@ fn paint_grass(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     }
 }
 
-/// Lowest leaf of a crown within the fence. [m, world]
+/// Minimum height of leaves of a crown within the fence. [m, world]
 pub(crate) const CROWN_FLOOR_M: f64 = 3.05;

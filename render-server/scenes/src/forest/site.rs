@@ -1,14 +1,14 @@
-//! Where things stand in the forest, and their true shapes.
+//! Layout of the forest, and true shapes of its objects.
 //!
-//! Trees stand so that the straight way to the goal is blocked at least [`BLOCKING_TREES`] times,
-//! a vehicle finds a gap of at least [`GAP_M`] between any two, and start and goal are free.
+//! At least [`BLOCKING_TREES`] trees block the straight line to the goal. The gap between any two other trees is at
+//! least [`GAP_M`]. Start and goal are free.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::Volume;
 
 use crate::random::{Rng, polar};
 
-/// One kind of tree; sets bark, leaves and shape.
+/// Species of a tree, which determines bark, leaves and shape.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Species {
     Pine,
@@ -16,8 +16,8 @@ pub(crate) enum Species {
     Birch,
 }
 
-/// A branch: a straight, tapering limb.
-// Why: each is a length or a position in metres, by its name.
+/// Straight limb: a branch, root or log.
+// Why: all fields are lengths or positions in metres.
 #[expect(clippy::struct_field_names)]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Limb {
@@ -26,24 +26,24 @@ pub(crate) struct Limb {
     pub(crate) radius_m: f64,
 }
 
-/// A tree: its axis, and the solids it is made of.
+/// Tree: axis and solids.
 #[derive(Clone, Debug)]
 pub(crate) struct Tree {
     pub(crate) species: Species,
-    /// Points of the axis from below the ground to the top, with the radius there. [m, world]
+    /// Points of the axis from below the ground to the top, with the radius at each. [m, world]
     pub(crate) axis: Vec<(DVec3, f64)>,
     pub(crate) roots: Vec<Limb>,
     pub(crate) branches: Vec<Limb>,
-    /// Trunk and roots, for the bark.
+    /// Solids of trunk and roots.
     pub(crate) trunk: Vec<Volume>,
-    /// Whether it stands within the fence: then it is painted finely, and is true geometry.
+    /// Whether the tree is within the fence. If so, it is painted finely, and its branches are true solids.
     pub(crate) within: bool,
-    /// Names the tree in noise.
+    /// Seed of the tree's noise.
     pub(crate) key: u64,
 }
 
 impl Tree {
-    /// Returns the axis point and radius at a height; clamped to the ends. [m]
+    /// Returns the axis point and radius at a height, clamped to the ends. [m]
     pub(crate) fn at_height(&self, z_m: f64) -> (DVec3, f64) {
         for pair in self.axis.windows(2) {
             let ((a, radius_a), (b, radius_b)) = (pair[0], pair[1]);
@@ -55,12 +55,12 @@ impl Tree {
         self.axis[self.axis.len() - 1]
     }
 
-    /// Returns the height of the tree's top. [m]
+    /// Returns the height of the top. [m]
     pub(crate) fn top_m(&self) -> f64 {
         self.axis[self.axis.len() - 1].0.z
     }
 
-    /// Returns the clear gap between two trunks up to the height at which vehicles fly. [m]
+    /// Returns the minimum gap between two trunks up to the flight height. [m]
     pub(crate) fn gap_m(&self, other: &Self) -> f64 {
         [0.5, 1.2, 2.0, 3.0]
             .into_iter()
@@ -72,14 +72,14 @@ impl Tree {
     }
 }
 
-/// A boulder; a sphere that is partly in the ground.
+/// Boulder: a sphere that is partly in the ground.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Rock {
     pub(crate) center_m: DVec3,
     pub(crate) radius_m: f64,
 }
 
-/// Everything that stands in the forest, and where the sun is.
+/// Objects of the forest, and direction of the sun.
 #[derive(Debug)]
 pub(crate) struct Site {
     pub(crate) seed: u64,
@@ -95,7 +95,7 @@ impl Site {
     /// Plans the forest of a seed.
     pub(crate) fn plan(seed: u64) -> Self {
         let mut rng = Rng::new(seed, 1);
-        // From the left or the right, high enough that light reaches the ground in streaks.
+        // The sun is on the left or right, high enough for streaks of light on the ground.
         let side = if rng.chance(0.5) { 1.0 } else { -1.0 };
         let azimuth_rad = side * rng.range(55f64.to_radians(), 100f64.to_radians());
         let elevation_rad = rng.range(34f64.to_radians(), 44f64.to_radians());
@@ -110,7 +110,7 @@ impl Site {
         site
     }
 
-    /// Returns the true obstacles and the floor.
+    /// Returns true obstacles and floor.
     pub(crate) fn truth(&self) -> Vec<Volume> {
         let mut volumes = vec![Volume::HalfSpace { normal: DVec3::Z, offset_m: 0.0 }];
         for tree in &self.trees {
@@ -128,14 +128,14 @@ impl Site {
         volumes
     }
 
-    /// Whether a point of the floor is this near to start or goal.
+    /// Whether a point of the floor is within `reach_m` of start or goal.
     pub(crate) fn is_near_ends(&self, p: DVec2, reach_m: f64) -> bool {
         [DVec2::new(SPAWN_X_M, 0.0), self.goal_m.truncate()]
             .iter()
             .any(|end| (p - *end).length() <= reach_m)
     }
 
-    /// Whether something of this reach leaves the surroundings of start and goal free.
+    /// Whether an object with this radius is outside the free areas of start and goal.
     fn is_clear_of_ends(&self, p: DVec2, reach_m: f64) -> bool {
         !self.is_near_ends(p, CLEAR_M + reach_m)
     }
@@ -177,7 +177,7 @@ impl Site {
             let out_m = (base.y.abs() - FENCE_Y_M).max(-1.0 - base.x).max(base.x - 41.0);
             let radius_m = rng.range(0.12, 0.32);
             let tree = grow(rng, base, radius_m, false);
-            // Nothing leans over the fence below the crowns.
+            // No tree leans over the fence below the crowns.
             if out_m > 0.9
                 && self.is_clear_of_ends(base, 1.0)
                 && self.trees.iter().all(|other| tree.gap_m(other) >= 1.1)
@@ -232,18 +232,18 @@ impl Site {
     }
 }
 
-/// Returns a limb's solid.
+/// Returns the solid of a limb.
 pub(crate) fn capsule(limb: &Limb) -> Volume {
     Volume::Capsule { a_m: limb.from_m, b_m: limb.to_m, radius_m: limb.radius_m }
 }
 
 fn slender_radius_m(rng: &mut Rng) -> f64 {
-    // Many slender trees, some stout.
+    // Most trees are slender.
     let t = rng.unit();
     0.125 + 0.15 * t * t + rng.range(0.0, 0.03)
 }
 
-/// Grows a tree whose axis passes `at` where vehicles fly.
+/// Generates a tree with the axis through `at` at flight height.
 fn grow(rng: &mut Rng, at: DVec2, radius_m: f64, within: bool) -> Tree {
     let species = match rng.below(10) {
         0..=4 => Species::Pine,
@@ -305,27 +305,27 @@ fn grow(rng: &mut Rng, at: DVec2, radius_m: f64, within: bool) -> Tree {
     Tree { species, axis, roots, branches, trunk, within, key: (rng.unit() * 1e9) as u64 }
 }
 
-/// Trees that stand across the straight line from start to goal, at least.
+/// Minimum number of trees that block the straight line from start to goal.
 pub(crate) const BLOCKING_TREES: usize = 3;
-/// Clear gap between any two trunks within the fence, at least. [m]
+/// Minimum gap between trunks within the fence. [m]
 pub(crate) const GAP_M: f64 = 1.6;
-/// Radius about start and goal that holds nothing solid. [m]
+/// Radius of the free areas around start and goal. [m]
 pub(crate) const CLEAR_M: f64 = 2.5;
-/// Where the vehicle starts. [m, world]
+/// Start of the vehicle along x. [m, world]
 pub(crate) const SPAWN_X_M: f64 = 1.0;
-/// Where it shall go. [m, world]
+/// Goal along x. [m, world]
 pub(crate) const GOAL_X_M: f64 = 37.5;
-/// Height at which vehicles take off, and of the goal. [m, world]
+/// Takeoff height, and height of the goal. [m, world]
 pub(crate) const FLIGHT_Z_M: f64 = 1.2;
 /// Half width of the fence. [m, world]
 pub(crate) const FENCE_Y_M: f64 = 7.0;
 
-/// Branches within the fence start above this. [m, world]
+/// Minimum height of branches within the fence. [m, world]
 const CROWN_BASE_M: f64 = 3.05;
 const TREES_WITHIN: usize = 44;
 const TREES_AROUND: usize = 92;
-/// Heights of the axis points; short steps where vehicles fly, so that a stack of capsules tapers
-/// within a centimetre. The last stands for the top.
+/// Heights of the axis points. Steps are short at flight height, so that the radius of the capsules is exact within a
+/// centimetre. The last value stands for the top.
 const HEIGHTS_M: [f64; 11] = [-0.4, 0.5, 1.0, 1.6, 2.3, 3.1, 4.0, 5.0, 6.2, 7.5, 9.0];
 
 #[cfg(test)]
@@ -333,7 +333,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn fifty_forests_keep_their_promises() {
+    fn fifty_forests_meet_all_constraints() {
         for seed in 0..50 {
             let site = Site::plan(seed);
             let within: Vec<&Tree> = site.trees.iter().filter(|tree| tree.within).collect();
@@ -343,7 +343,7 @@ mod tests {
             let blocking = within
                 .iter()
                 .filter(|tree| {
-                    // A trunk that the line itself runs into.
+                    // Trunks that intersect the line.
                     tree.trunk.iter().any(|part| {
                         (0..=4000).any(|n| {
                             let p_m = start_m.lerp(site.goal_m, f64::from(n) / 4000.0);
@@ -362,7 +362,7 @@ mod tests {
             }
             for centre in [start_m, site.goal_m] {
                 for volume in site.truth().iter().skip(1) {
-                    // The zone is a disc on the floor, up to where crowns begin.
+                    // The free area is a cylinder from the floor up to the crowns.
                     for z_m in [0.0, 0.6, 1.2, 2.0, 2.9] {
                         let p_m = centre.truncate().extend(z_m);
                         let free_m = volume.signed_distance_m(p_m);
@@ -375,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_hangs_where_vehicles_fly() {
+    fn branches_are_above_the_flight_height() {
         for seed in 0..10 {
             for tree in Site::plan(seed).trees.iter().filter(|tree| tree.within) {
                 for branch in &tree.branches {

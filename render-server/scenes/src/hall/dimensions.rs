@@ -1,24 +1,24 @@
-//! Where the hall, its net, windows and tubes are.
+//! Dimensions of the hall, its net, windows and lamps.
 
 use glam::{DVec2, DVec3};
 
-/// Inside of the hall's walls. [m, world]
+/// Minimum corner of the hall's inside. [m, world]
 pub(crate) const HALL_MIN_M: DVec3 = DVec3::new(-3.0, -5.0, 0.0);
-/// Inside of the hall's walls and ceiling. [m, world]
+/// Maximum corner of the hall's inside. [m, world]
 pub(crate) const HALL_MAX_M: DVec3 = DVec3::new(14.0, 5.0, 5.0);
-/// The netted flight space: 11 x 4.5 x 3.65 m. [m, world]
+/// Minimum corner of the netted flight space of 11 x 4.5 x 3.65 m. [m, world]
 pub(crate) const NET_MIN_M: DVec3 = DVec3::new(0.0, -2.25, 0.0);
-/// The netted flight space. [m, world]
+/// Maximum corner of the netted flight space. [m, world]
 pub(crate) const NET_MAX_M: DVec3 = DVec3::new(11.0, 2.25, 3.65);
 
-/// A window of the north wall, in metres along the wall from its west end and up.
+/// Window of the north wall, in metres along the wall from its west end and up.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Window {
     pub(super) min_m: DVec2,
     pub(super) max_m: DVec2,
 }
 
-/// The windows.
+/// Windows of the north wall.
 pub(crate) const WINDOWS: [Window; 4] =
     [Window::at(1.2), Window::at(5.2), Window::at(9.2), Window::at(13.2)];
 
@@ -31,7 +31,7 @@ impl Window {
         p.cmpge(self.min_m - margin_m).all() && p.cmple(self.max_m + margin_m).all()
     }
 
-    /// Whether light passes at a point of the wall: within the window, beside its bars.
+    /// Whether light passes at a point of the wall: within the window, but not on its bars.
     pub(crate) fn is_pane(&self, p: DVec2) -> bool {
         let across = (p - self.min_m) / (self.max_m - self.min_m);
         let bar = |t: f64| (t - t.round()).abs() < 0.055;
@@ -39,7 +39,7 @@ impl Window {
     }
 }
 
-/// Middles of the ceiling tubes. [m, world]
+/// Centres of the ceiling tubes. [m, world]
 pub(crate) const LAMPS_M: [DVec2; 8] = [
     DVec2::new(-0.5, -1.6),
     DVec2::new(3.5, -1.6),

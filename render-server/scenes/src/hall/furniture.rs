@@ -1,4 +1,4 @@
-//! What stands about the net: tables with screens, shelves, crates, mats and a bench; all boxes.
+//! Furniture around the net: tables with screens, shelves, crates, mats and a bench, all made of boxes.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::Volume;
@@ -8,14 +8,14 @@ use super::texture;
 use crate::canvas::paint;
 use crate::random::{Rng, fractal2, noise2};
 
-/// The furniture of a hall.
+/// Furniture of a hall.
 #[derive(Debug)]
 pub(crate) struct Furniture {
     seed: u64,
     pieces: Vec<Piece>,
 }
 
-/// A box with its texture.
+/// Box with its texture.
 #[derive(Debug)]
 struct Piece {
     block: Block,
@@ -27,7 +27,7 @@ struct Piece {
 enum Surface {
     Plain,
     Wood,
-    /// Shows something on its face towards the net.
+    /// Screen on the face towards the net.
     Screen,
     Carton,
 }
@@ -40,12 +40,12 @@ impl Furniture {
         furniture
     }
 
-    /// Returns its solids.
+    /// Returns the solids.
     pub(crate) fn volumes(&self) -> impl Iterator<Item = Volume> {
         self.pieces.iter().map(|piece| piece.block.volume())
     }
 
-    /// Returns the boxes whose shadows are seen.
+    /// Returns the boxes that cast visible shadows.
     pub(crate) fn casters(&self) -> Vec<Volume> {
         let large = |piece: &&Piece| {
             let half_m = piece.block.half_m;
@@ -54,7 +54,7 @@ impl Furniture {
         self.pieces.iter().filter(large).map(|piece| piece.block.volume()).collect()
     }
 
-    /// Paints all of it.
+    /// Paints all pieces.
     pub(crate) fn paint(&self, painter: &mut Painter) {
         for (n, piece) in self.pieces.iter().enumerate() {
             let seed = self.seed ^ (n as u64 * 77);
@@ -63,7 +63,7 @@ impl Furniture {
             let coarse_m = if size_m < 0.12 { 0.06 } else { 0.11 };
             let grain = Grain { coarse_m, fine_m: 0.045 };
             let screen_face = if piece.block.center_m.y > 0.0 { 2 } else { 3 };
-            // Undersides that stand on something are never seen.
+            // Undersides on a surface are never visible.
             let skip: &[usize] = if piece.block.half_m.z > 0.1 { &[4] } else { &[] };
             painter.cuboid(&piece.block, grain, skip, &|face, p| {
                 Some(match piece.kind {
@@ -105,7 +105,7 @@ impl Furniture {
         for at in [DVec2::new(8.6, 4.3), DVec2::new(12.9, 3.2), DVec2::new(-2.2, -3.4)] {
             self.crates(rng, at);
         }
-        // Crash mats leaning at the far end, and a bench before the near wall.
+        // Crash mats at the far end, and a bench in front of the near wall.
         let mat = Block::between(DVec3::new(13.3, -2.2, 0.0), DVec3::new(13.65, -0.2, 1.25));
         self.put(mat, paint(0x2858a8), Surface::Plain);
         let mat = Block::between(DVec3::new(13.3, 0.1, 0.0), DVec3::new(13.65, 2.1, 1.25));
@@ -133,7 +133,7 @@ impl Furniture {
             let leg = between(foot - 0.03, 0.0, foot + 0.03, 0.71);
             self.put(leg, paint(0x303236), Surface::Plain);
         }
-        // Screens stand on the far side of the table and look at the net.
+        // Screens are on the far side of the table and face the net.
         let back = half.y * 0.4 * at.y.signum();
         for x in [-0.45, 0.35] {
             let middle = DVec2::new(x + rng.spread(0.08), back);
@@ -147,7 +147,7 @@ impl Furniture {
         let cup = DVec2::new(rng.range(-0.1, 0.1), -0.15 * at.y.signum());
         let colour = BRIGHT[rng.below(BRIGHT.len())];
         self.put(between(cup - 0.06, 0.75, cup + 0.06, 0.87), paint(colour), Surface::Plain);
-        // A chair before it.
+        // A chair in front of the table.
         let chair = DVec2::new(rng.range(-0.4, 0.4), -0.75 * at.y.signum());
         self.put(between(chair - 0.22, 0.43, chair + 0.22, 0.49), paint(0x25282d), Surface::Plain);
         self.put(between(chair - 0.03, 0.0, chair + 0.03, 0.43), paint(0x3a3d42), Surface::Plain);

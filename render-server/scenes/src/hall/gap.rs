@@ -1,4 +1,4 @@
-//! A wall across the net with an irregular gap: on every height one opening whose edges wander.
+//! Wall across the net with an irregular gap, which has one opening at each height.
 
 use glam::{DVec2, DVec3};
 use vizflyt_arena::config::StageConfig;
@@ -9,16 +9,15 @@ use super::texture;
 use crate::canvas::{Patch, paint};
 use crate::random::Rng;
 
-/// A wall of bricks with a hole.
+/// Brick wall with a gap.
 #[derive(Clone, Debug)]
 pub(crate) struct GapWall {
     seed: u64,
     x_m: f64,
-    /// Middle of the gap: y and z. [m, world]
+    /// Centre of the gap: y and z. [m, world]
     middle_m: DVec2,
     half_height_m: f64,
-    /// How far the gap reaches to the right (-y) and left (+y) of its middle, from its lower to
-    /// its upper end. [m]
+    /// Extent of the gap to the right (-y) and left (+y) of its centre, from its lower to its upper end. [m]
     reach_m: [[f64; KNOTS]; 2],
 }
 
@@ -37,7 +36,7 @@ impl GapWall {
             }
         }
         let mut wall = Self { seed, x_m, middle_m, half_height_m, reach_m };
-        // Widen it until the vehicle passes well: the draw itself stays irregular.
+        // Widen the gap until the vehicle fits, and keep its irregular shape.
         while wall.clearance_m() < CLEARANCE_M {
             for reach in wall.reach_m.iter_mut().flatten() {
                 *reach *= 1.04;
@@ -46,8 +45,8 @@ impl GapWall {
         wall
     }
 
-    /// Returns the gap as a stage of the course: a rectangle about its middle, as high as the gap
-    /// and as wide as its narrower side reaches, twice.
+    /// Returns the gap as a stage of the course: a rectangle around its centre with the height of the gap and twice the
+    /// extent of its narrower side.
     pub(crate) fn stage(&self, name: &str) -> StageConfig {
         let [right, left] = self.reach_m.map(|side| side.into_iter().fold(0.0, f64::max));
         StageConfig {
@@ -60,7 +59,7 @@ impl GapWall {
         }
     }
 
-    /// Returns its solids: whole courses below and above the gap, thin ones beside it.
+    /// Returns the solids: complete blocks below and above the gap, thin layers next to it.
     pub(crate) fn blocks(&self) -> Vec<Block> {
         let (low, high) = self.gap_z_m();
         let mut blocks = vec![
@@ -78,7 +77,7 @@ impl GapWall {
         blocks
     }
 
-    /// Returns few boxes that throw about the same shadow.
+    /// Returns a few boxes with approximately the same shadow.
     pub(crate) fn casters(&self) -> Vec<Block> {
         let (low, high) = self.gap_z_m();
         let mean = |side: [f64; KNOTS]| side.iter().sum::<f64>() / KNOTS as f64;
@@ -91,7 +90,7 @@ impl GapWall {
         ]
     }
 
-    /// Paints it.
+    /// Paints the wall.
     pub(crate) fn paint(&self, painter: &mut Painter) {
         let whole = self.course(NET_MIN_M.y, NET_MAX_M.y, 0.0, TOP_M);
         let grain = Grain { coarse_m: 0.1, fine_m: 0.03 };
@@ -113,7 +112,7 @@ impl GapWall {
         self.paint_rim(painter);
     }
 
-    /// The thickness of the wall, seen within the gap.
+    /// Paints the inner surfaces of the gap.
     fn paint_rim(&self, painter: &mut Painter) {
         let (low, high) = self.gap_z_m();
         let step_m = 0.035;
@@ -178,7 +177,7 @@ impl GapWall {
         (low..high).contains(&z_m) && (right..left).contains(&y_m)
     }
 
-    /// Returns the distance from the gap's middle to its edge. [m]
+    /// Returns the minimum distance from the gap's centre to its edge. [m]
     fn clearance_m(&self) -> f64 {
         let (low, high) = self.gap_z_m();
         (0..=200).fold(self.half_height_m, |least, n| {
@@ -199,9 +198,9 @@ impl GapWall {
 }
 
 const KNOTS: usize = 8;
-/// A circle of this radius about the gap's middle is free: 0.8 m clear. [m]
+/// Minimum free radius around the gap's centre: 0.8 m of width. [m]
 const CLEARANCE_M: f64 = 0.41;
-/// Height of one course of the true wall beside the gap: finer than a voxel. [m]
+/// Height of a layer of the true wall next to the gap, finer than a voxel. [m]
 const COURSE_M: f64 = 0.04;
 const THICK_M: f64 = 0.12;
 const TOP_M: f64 = 3.1;

@@ -1,4 +1,4 @@
-//! Racing windows: square frames on stands, with chequered corners and coloured bars.
+//! Racing windows: frames on stands, with chequered corners and coloured bars.
 
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_arena::config::StageConfig;
@@ -6,18 +6,18 @@ use vizflyt_arena::config::StageConfig;
 use super::panel::{Block, Grain, Look, Painter};
 use crate::canvas::paint;
 
-/// A framed opening on two legs.
+/// Frame with an opening, on two legs.
 #[derive(Clone, Debug)]
 pub(crate) struct Gate {
-    /// Middle of the opening. [m, world]
+    /// Centre of the opening. [m, world]
     pub(crate) center_m: DVec3,
-    /// Direction of passage: from x, counter-clockwise. [rad, world]
+    /// Direction of passage, counter-clockwise from x. [rad, world]
     pub(crate) yaw_rad: f64,
     /// Width and height of the opening. [m]
     pub(crate) opening_m: DVec2,
-    /// Colours of the bars and their stripes.
+    /// Colours of bars and stripes.
     pub(crate) colours: (DVec3, DVec3),
-    /// Whether a motor stands on the lower bar, which turns a hand.
+    /// Whether the lower bar has a motor, which turns a hand.
     pub(crate) with_hub: bool,
 }
 
@@ -34,18 +34,18 @@ impl Gate {
         }
     }
 
-    /// Returns its solids: four bars, two legs, two feet, and the hub if it has one.
+    /// Returns the solids: four bars, two legs, two feet, and the motor if there is one.
     pub(crate) fn blocks(&self) -> Vec<Block> {
         self.bars().into_iter().chain(self.stand()).collect()
     }
 
-    /// Paints its bars.
+    /// Paints the bars.
     pub(crate) fn paint_frame(&self, painter: &mut Painter) {
         let middle_m = self.center_m;
         let back = self.rotation().conjugate();
         let outer_m = self.opening_m / 2.0 + BAR_M;
         for (n, bar) in self.bars().into_iter().enumerate() {
-            // The level bars' ends touch the upright ones.
+            // The ends of the horizontal bars touch the vertical ones.
             let skip: &[usize] = if n < 2 { &[] } else { &[2, 3] };
             let grain = Grain { coarse_m: 0.04, fine_m: 0.02 };
             let offset = back * (bar.center_m - middle_m);
@@ -61,7 +61,7 @@ impl Gate {
                 } else if (outer_m - DVec2::new(y, z)).min_element() < 0.02 {
                     pale
                 } else {
-                    // Arrowheads that point to the middle of each side.
+                    // Arrowheads that point to the centre of each side.
                     let (along, across) =
                         if y > outer_m.x - BAR_M { (z, y - outer_m.x) } else { (y, z - outer_m.y) };
                     let wedge = along + (across + BAR_M / 2.0).abs();
@@ -71,7 +71,7 @@ impl Gate {
         }
     }
 
-    /// Paints legs and feet, and the hub if it has one.
+    /// Paints legs, feet, and the motor if there is one.
     pub(crate) fn paint_stand(&self, painter: &mut Painter) {
         for (n, block) in self.stand().into_iter().enumerate() {
             let hub = n == 4;
@@ -86,7 +86,7 @@ impl Gate {
         }
     }
 
-    /// Returns a point given in the gate's axes (x along the passage, z up) from its middle. [m, world]
+    /// Returns the position of a point in the gate's axes (x along the passage, z up, from its centre). [m, world]
     pub(crate) fn at(&self, offset_m: DVec3) -> DVec3 {
         self.center_m + self.rotation() * offset_m
     }
@@ -95,7 +95,7 @@ impl Gate {
         DQuat::from_rotation_z(self.yaw_rad)
     }
 
-    /// Left, right, top, bottom.
+    /// Returns the bars: left, right, top, bottom.
     fn bars(&self) -> [Block; 4] {
         let half = self.opening_m / 2.0;
         let across = half.x + BAR_M / 2.0;

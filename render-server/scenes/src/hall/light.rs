@@ -1,5 +1,5 @@
-//! Baked light of the hall: rows of ceiling tubes with soft shadows, sun through the windows, and
-//! what walls and floor throw about.
+//! Baked light of the hall: ceiling tubes with soft shadows, sun through the windows, and light reflected by walls and
+//! floor.
 
 use glam::{DMat3, DVec2, DVec3};
 use vizflyt_protocol::geometry::Volume;
@@ -8,7 +8,7 @@ use super::dimensions::{HALL_MAX_M, HALL_MIN_M, LAMPS_M, TUBE_HALF_M, WINDOWS};
 use crate::random::Rng;
 use crate::solids::Solids;
 
-/// Answers how much light leaves a surface in the hall.
+/// Light that leaves surfaces in the hall.
 #[derive(Debug)]
 pub(crate) struct HallLight<'a> {
     solids: &'a Solids,
@@ -18,7 +18,7 @@ pub(crate) struct HallLight<'a> {
 }
 
 impl<'a> HallLight<'a> {
-    /// Prepares the light; `casters` throw shadows.
+    /// Prepares the light; `casters` cast shadows.
     pub(crate) fn new(solids: &'a Solids, casters: &[Volume], sun: DVec3) -> Self {
         Self { solids, casters: casters.iter().filter_map(Caster::new).collect(), sun }
     }
@@ -28,7 +28,7 @@ impl<'a> HallLight<'a> {
         let from_m = p_m + normal * 0.02;
         let mut light = DVec3::ZERO;
         for lamp in LAMPS_M {
-            // Two points of the tube: a penumbra where many patches average.
+            // Two random points of the tube: averaged over many patches, they give a penumbra.
             for _ in 0..2 {
                 let along = rng.spread(TUBE_HALF_M);
                 let tube_m = DVec3::new(lamp.x + along, lamp.y, HALL_MAX_M.z - 0.1);
@@ -45,7 +45,7 @@ impl<'a> HallLight<'a> {
         if facing > 0.0 && self.sun_enters(from_m) && !self.is_blocked(from_m, self.sun, 30.0) {
             light += SUN * facing;
         }
-        // Ceiling and walls are pale: shade is never black; the window side is cooler.
+        // Ceiling and walls are pale, so that shade is never black; the window side is cooler.
         let up = 0.5 + 0.5 * normal.z;
         let window = 0.5 + 0.5 * normal.y;
         let about = BOUNCE * (0.75 + 0.25 * up) + WINDOW * (0.3 + 0.7 * window);
@@ -67,7 +67,7 @@ impl<'a> HallLight<'a> {
     }
 }
 
-/// A box that throws shadows.
+/// Box that casts shadows.
 #[derive(Debug)]
 struct Caster {
     center_m: DVec3,
@@ -77,14 +77,14 @@ struct Caster {
 }
 
 impl Caster {
-    /// Takes boxes; other shapes throw no shadow here.
+    /// Returns the caster of a box; `None` for other shapes, which cast no shadows.
     fn new(volume: &Volume) -> Option<Self> {
         let Volume::Cuboid { center_m, half_m, rotation } = *volume else { return None };
         let axes_from_world = DMat3::from_quat(rotation.conjugate());
         Some(Self { center_m, half_m, axes_from_world, reach_m: half_m.length() })
     }
 
-    /// Whether a ray meets the box within a length.
+    /// Whether a ray hits the box within a length.
     fn crosses(&self, from_m: DVec3, toward: DVec3, length_m: f64) -> bool {
         let to_center = self.center_m - from_m;
         let along = to_center.dot(toward);
@@ -123,7 +123,7 @@ mod tests {
     use glam::DQuat;
 
     #[test]
-    fn a_ray_meets_what_it_passes_through() {
+    fn a_ray_hits_only_boxes_on_its_path() {
         let block = Volume::Cuboid {
             center_m: DVec3::new(2.0, 0.0, 0.0),
             half_m: DVec3::new(0.1, 0.5, 0.5),
@@ -132,8 +132,8 @@ mod tests {
         let caster = Caster::new(&block).unwrap();
         let crosses = |from, toward, length| caster.crosses(from, toward, length);
         assert!(crosses(DVec3::ZERO, DVec3::X, 3.0));
-        assert!(!crosses(DVec3::ZERO, DVec3::X, 1.5), "it ends before");
-        assert!(!crosses(DVec3::ZERO, DVec3::NEG_X, 3.0), "it is behind");
-        assert!(!crosses(DVec3::new(0.0, 0.7, 0.0), DVec3::X, 3.0), "it passes by");
+        assert!(!crosses(DVec3::ZERO, DVec3::X, 1.5), "the ray ends before the box");
+        assert!(!crosses(DVec3::ZERO, DVec3::NEG_X, 3.0), "the box is behind");
+        assert!(!crosses(DVec3::new(0.0, 0.7, 0.0), DVec3::X, 3.0), "the ray misses the box");
     }
 }

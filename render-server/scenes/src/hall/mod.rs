@@ -1,8 +1,7 @@
-//! The netted lab, 11 x 4.5 x 3.65 m, empty (`room`) or with a race course (`race`).
+//! Netted lab of 11 x 4.5 x 3.65 m, empty (`room`) or with a race course (`race`).
 //!
-//! Data flow: [`shell`] plans the hall, [`gate`] and [`gap`] what stands in the net, all as true
-//! boxes; [`light`] answers how much light arrives at a point; [`panel`] covers every face with
-//! Gaussians as fine as its [`texture`] needs.
+//! Data flow: [`shell`] plans the hall, [`gate`] and [`gap`] the course in the net, all as true boxes. [`light`]
+//! computes the light at a point. [`panel`] covers each face with Gaussians as fine as its [`texture`] requires.
 
 mod dimensions;
 mod furniture;
@@ -41,45 +40,45 @@ use panel::{Block, Grain, Look, Painter};
 use pillars::Pillars;
 use shell::Shell;
 
-/// What stands in the net, along the flight in this order.
+/// Contents of the net, in this order along the flight.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct Layout {
-    /// Racing windows; at most as many as have colours, three.
+    /// Number of racing windows; at most three, the number of colours.
     pub(crate) windows: usize,
-    /// Whether a wall with a gap follows them.
+    /// Whether a wall with a gap follows the windows.
     pub(crate) gap: bool,
     /// Whether a window with a rotating hand comes last.
     pub(crate) hand: bool,
-    /// Whether pillars stand where there is room.
+    /// Whether there are pillars.
     pub(crate) pillars: bool,
-    /// Whether a door slides in a doorway.
+    /// Whether there is a doorway with a sliding door.
     pub(crate) door: bool,
-    /// Whether a pendulum swings across the way.
+    /// Whether a pendulum swings across the path.
     pub(crate) pendulum: bool,
-    /// Whether another drone flies to and fro.
+    /// Whether another drone flies back and forth.
     pub(crate) drone: bool,
 }
 
-/// Returns the empty netted room of a seed.
+/// Returns the empty netted room for a seed.
 pub(crate) fn build_room(seed: u64, staging: &mut Staging) -> Generated {
     let goal = Goal { position_m: DVec3::new(10.0, 0.0, 1.2), radius_m: 0.6 };
     build(seed, "room", &Course::default(), goal, 3.0, staging)
 }
 
-/// Returns the race of a seed: everything that stands in a course, one behind the other.
+/// Returns the race for a seed: windows, gap and clock hand, one behind the other.
 pub(crate) fn build_race(seed: u64, staging: &mut Staging) -> Generated {
     let layout = Layout { windows: 3, gap: true, hand: true, ..Layout::default() };
     build_staged(seed, "race", layout, staging)
 }
 
-/// Returns the net of a seed with things in it that move by themselves.
+/// Returns the netted room for a seed with moving objects.
 pub(crate) fn build_moving(seed: u64, staging: &mut Staging) -> Generated {
     let layout = Layout { door: true, pendulum: true, drone: true, ..Layout::default() };
     build_staged(seed, "moving", layout, staging)
 }
 
-/// Returns the net of a seed with a layout in it.
+/// Returns the netted room for a seed with a layout.
 pub(crate) fn build_course(seed: u64, name: &str, layout: Layout) -> Generated {
     build_staged(seed, name, layout, &mut Staging::none())
 }
@@ -90,7 +89,7 @@ fn build_staged(seed: u64, name: &str, layout: Layout, staging: &mut Staging) ->
     build(seed, name, &course, goal, 4.0, staging)
 }
 
-/// What stands in the net.
+/// Objects in the net.
 #[derive(Debug, Default)]
 struct Course {
     windows: Vec<Gate>,
@@ -112,8 +111,8 @@ impl Course {
             } else {
                 DVec2::splat(rng.range(1.0, 1.35))
             };
-            // The lower bar stays a hand above the floor, the upper below the net; a hand that
-            // turns needs its own length below the motor.
+            // The lower bar is at least 0.1 m above the floor, and the upper bar below the net. A clock hand needs its
+            // length below the motor.
             let z_m = if with_hub {
                 HAND_M + 0.06 + opening_m.y / 2.0 + rng.range(0.0, 0.2)
             } else {
@@ -157,7 +156,7 @@ impl Course {
         Self { windows, gap, hand, pillars, doorway, movers }
     }
 
-    /// Returns each gate with the name of its stage.
+    /// Returns all gates with the names of their stages.
     fn gates(&self) -> impl Iterator<Item = (&Gate, String)> {
         let window = |(n, gate)| (gate, format!("window {}", n + 1));
         let hand = self.hand.iter().map(|gate| (gate, HAND.to_owned()));
@@ -188,8 +187,8 @@ impl Course {
 }
 
 impl Layout {
-    /// Returns where things stand along x: evenly from the first to the last; one alone stands in
-    /// the middle. [m, world]
+    /// Returns the positions of objects along x, evenly from the first to the last; a single object is in the middle.
+    /// [m, world]
     fn places_m(self) -> Vec<f64> {
         let count = self.windows + usize::from(self.gap) + usize::from(self.hand);
         if count == 1 {
@@ -200,14 +199,14 @@ impl Layout {
     }
 }
 
-/// What the stages are called.
+/// Names of stages.
 const GAP: &str = "gap";
 const HAND: &str = "clock hand";
-/// Where the first thing to fly through stands along x. [m, world]
+/// Position of the first opening along x. [m, world]
 const FIRST_M: f64 = 2.3;
-/// And the last: enough room behind it to stop before the net. [m, world]
+/// Position of the last opening along x, with enough space behind it to stop before the net. [m, world]
 const LAST_M: f64 = 8.95;
-/// Where what moves stands along x. [m, world]
+/// Positions of moving objects along x. [m, world]
 const DOOR_M: f64 = 3.4;
 const PENDULUM_M: f64 = 5.9;
 const DRONE_M: f64 = 8.3;
@@ -226,7 +225,7 @@ fn build(
     let geofence = Geofence { min_m: NET_MIN_M - DVec3::Z * 0.5, max_m: NET_MAX_M };
     let stage = Stage {
         fence: &geofence,
-        // Nets are lifted: one may walk out to the walls.
+        // A person can lift the net and walk up to the walls.
         around_m: 3.0,
         walls: &shell::walls(),
         movers: &course.movers.keep_out(),
@@ -237,7 +236,7 @@ fn build(
     let casters: Vec<Volume> =
         shell.casters().into_iter().chain(course.casters().iter().map(Block::volume)).collect();
     let mut rng = Rng::new(seed, 22);
-    // Through the north windows, afternoon-low.
+    // Low afternoon sun through the north windows.
     let sun = DVec3::new(rng.spread(0.5), 1.0, rng.range(0.62, 0.8)).normalize();
     let light = HallLight::new(&solids, &casters, sun);
     let mut painter = Painter { canvas: Canvas::default(), rng, light };
@@ -311,8 +310,7 @@ fn build(
     }
 }
 
-/// Returns the colour of the floor mats: one-metre tiles with seams, scuffs, and a ring at each
-/// place to start from or land on.
+/// Returns the colour of the floor mats: tiles of one metre with seams, scuffs, and a ring at start and goal.
 fn mats(seed: u64, at: DVec2, pads_m: &[DVec3]) -> DVec3 {
     let (dark, bright) =
         [(0x35567a, 0x4a6f94), (0x4a4f56, 0x646a70), (0x2f6359, 0x47806f)][(seed % 3) as usize];
@@ -360,8 +358,7 @@ mod tests {
                 let free_m = clearance_m(stage.center_m);
                 assert!(free_m >= 0.35, "seed {seed}: {free_m} m in {}", stage.name);
             }
-            // Between two stages there is a way: straight from half a metre behind one to half
-            // a metre before the next.
+            // There is a straight free path from half a metre behind each stage to half a metre before the next one.
             for pair in stages.windows(2) {
                 let from_m = pair[0].center_m + pair[0].normal * 0.5;
                 let to_m = pair[1].center_m - pair[1].normal * 0.5;
@@ -371,7 +368,7 @@ mod tests {
                     assert!(free_m >= 0.2, "seed {seed}: {free_m} m before {}", pair[1].name);
                 }
             }
-            // Nothing reaches through the net or into another piece.
+            // Nothing reaches through the net.
             for (gate, _) in course.gates() {
                 for block in gate.blocks() {
                     let (low, high) = crate::solids::bounds(&block.volume()).unwrap();
@@ -383,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gates_part_is_its_bars_and_all_of_them() {
+    fn the_part_of_a_gate_contains_exactly_its_bars() {
         for seed in 0..3 {
             let scene = build_race(seed, &mut Staging::none());
             let course = Course::draw(seed, RACE);
@@ -399,7 +396,7 @@ mod tests {
                     if part.splats.contains(&i) {
                         assert!(on_surface, "seed {seed}, {name}: {off_m} m");
                     } else {
-                        // The motor stands in the lower bar.
+                        // The motor intersects the lower bar.
                         assert!(off_m > -0.002 || gate.with_hub, "seed {seed}, {name}: {off_m} m");
                     }
                 }

@@ -1,5 +1,5 @@
-//! What moves in the net: the hand of the last window, a sliding door, a pendulum, a second drone.
-//! Each is painted where it rests, in the hall's light, and then taken into its own frame.
+//! Moving objects in the net: hand of the last window, sliding door, pendulum, second drone. Each is painted at its
+//! rest pose in the hall's light, and then transformed to the object frame.
 
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_arena::config::{MotionConfig, ObjectConfig};
@@ -13,17 +13,17 @@ use super::panel::{Block, Grain, Look, Painter};
 use crate::canvas::paint;
 use crate::random::Rng;
 
-/// What moves in a course.
+/// Moving objects of a course.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Movers {
     movers: Vec<Mover>,
 }
 
-/// One thing that moves.
+/// Moving object.
 #[derive(Clone, Debug)]
 struct Mover {
     name: &'static str,
-    /// Where it rests. [m, world]
+    /// Rest position. [m, world]
     position_m: DVec3,
     yaw_rad: f64,
     phase_s: f64,
@@ -38,22 +38,22 @@ enum Shape {
     Quadrotor,
 }
 
-/// A mover as a scene has it.
+/// Generated moving object.
 pub(crate) struct GeneratedMover {
     pub(crate) config: ObjectConfig,
     pub(crate) object: RigidObject,
-    /// [m, object]
+    /// True solids. [m, object]
     pub(crate) truth: Vec<Volume>,
 }
 
 impl Movers {
-    /// Adds the hand of a window, on its motor: it turns evenly, as a clock's does, either way round.
+    /// Adds the hand of a window on its motor. It rotates at constant speed in either direction.
     pub(crate) fn add_hand(&mut self, seed: u64, gate: &Gate) {
         let mut rng = Rng::new(seed, 41);
         let speed_deg_ps = rng.range(45.0, 65.0);
         let period_s = 360.0 / speed_deg_ps;
         let side = if rng.chance(0.5) { 1.0 } else { -1.0 };
-        // Before the window's bars, so that it passes them.
+        // The hand is in front of the window's bars, so that it passes them.
         let pivot_m = gate.at(DVec3::new(-HAND_AHEAD_M, 0.0, -gate.opening_m.y / 2.0));
         let bar = Block::between(
             DVec3::new(-0.015, -0.035, -HAND_TAIL_M),
@@ -69,7 +69,7 @@ impl Movers {
         });
     }
 
-    /// Adds a door that slides across the net at `x_m`, between two walls that leave a doorway.
+    /// Adds a door that slides across the net at `x_m`, at a doorway between two walls.
     pub(crate) fn add_door(&mut self, seed: u64, x_m: f64) {
         let mut rng = Rng::new(seed, 42);
         let leaf = Block::between(DVec3::new(-0.03, -0.45, 0.05), DVec3::new(0.03, 0.45, 2.35));
@@ -89,12 +89,12 @@ impl Movers {
         });
     }
 
-    /// Adds a pendulum that swings across the net at `x_m`: a block on a rod.
+    /// Adds a pendulum (block on a rod) that swings across the net at `x_m`.
     pub(crate) fn add_pendulum(&mut self, seed: u64, x_m: f64) {
         let mut rng = Rng::new(seed, 43);
         let rod = Block::between(DVec3::new(-0.015, -0.015, -1.7), DVec3::new(0.015, 0.015, 0.0));
         let bob = Block::between(DVec3::new(-0.14, -0.14, -1.98), DVec3::new(0.14, 0.14, -1.7));
-        // As a mathematical pendulum of its length takes: 2 pi sqrt(l / g).
+        // Period of a mathematical pendulum of this length: 2 pi sqrt(l / g).
         let period_s = 2.0 * core::f64::consts::PI * (1.84f64 / 9.81).sqrt();
         self.movers.push(Mover {
             name: "pendulum",
@@ -114,7 +114,7 @@ impl Movers {
         });
     }
 
-    /// Adds a drone that flies to and fro across the net at `x_m`.
+    /// Adds a drone that flies back and forth across the net at `x_m`.
     pub(crate) fn add_drone(&mut self, seed: u64, x_m: f64) {
         let mut rng = Rng::new(seed, 44);
         let reach_m = NET_MAX_M.y - 0.7;
@@ -135,7 +135,7 @@ impl Movers {
         });
     }
 
-    /// Returns upright columns about what moves, that nobody should walk into. [m, world]
+    /// Returns vertical columns around moving objects, which walks must avoid. [m, world]
     pub(crate) fn keep_out(&self) -> Vec<Volume> {
         let column = |mover: &Mover| {
             let at = mover.position_m.truncate();
@@ -144,7 +144,7 @@ impl Movers {
         self.movers.iter().map(column).collect()
     }
 
-    /// Makes all of them; objects are numbered from 1.
+    /// Generates all objects, with ids from 1.
     pub(crate) fn make(&self, painter: &mut Painter) -> Vec<GeneratedMover> {
         let numbered = self.movers.iter().zip(1..);
         numbered.map(|(mover, id)| mover.make(id, painter)).collect()
@@ -183,7 +183,7 @@ impl Mover {
         GeneratedMover { config, object: RigidObject { id, splats }, truth }
     }
 
-    /// As in the arena file: degrees, and back.
+    /// Returns the rest pose, with the yaw rounded as in the arena file: converted to degrees and back.
     fn rest(&self) -> Pose<World, Object> {
         let yaw_rad = self.yaw_rad.to_degrees().to_radians();
         Pose::new(self.position_m, DQuat::from_rotation_z(yaw_rad))
@@ -208,8 +208,8 @@ fn paint_block(
     });
 }
 
-/// Returns the walls beside a sliding door, just behind its leaf: it leaves the doorway free at each
-/// end of its way. [m, world]
+/// Returns the walls next to a sliding door, just behind its leaf. The doorway is free at each end of the door's
+/// motion. [m, world]
 pub(crate) fn doorway(x_m: f64) -> [Block; 2] {
     let wall = |low_m: f64, high_m: f64| {
         Block::between(DVec3::new(x_m + 0.06, low_m, 0.0), DVec3::new(x_m + 0.16, high_m, 2.5))
@@ -220,7 +220,7 @@ pub(crate) fn doorway(x_m: f64) -> [Block; 2] {
 /// Width of a doorway. [m]
 const DOORWAY_M: f64 = 1.5;
 
-/// Takes splats of the world into the frame of an object that rests there.
+/// Transforms splats from the world to the frame of an object with this rest pose.
 fn into_frame(mut splats: Splats, rest: &Pose<World, Object>) -> Splats {
     let object_from_world = rest.inverse();
     for mean_m in &mut splats.means_m {
@@ -233,18 +233,18 @@ fn into_frame(mut splats: Splats, rest: &Pose<World, Object>) -> Splats {
     splats
 }
 
-/// From the pivot to the hand's tip: almost to the window's upper bar. [m]
+/// Length from the pivot to the hand's tip, almost up to the window's upper bar. [m]
 pub(crate) const HAND_M: f64 = 0.95;
-/// Behind the pivot. [m]
+/// Length of the hand behind the pivot. [m]
 const HAND_TAIL_M: f64 = 0.08;
-/// The hand turns this far before the middle of the window: clear of the motor. [m]
+/// Distance of the hand in front of the window's centre plane, so that it is clear of the motor. [m]
 const HAND_AHEAD_M: f64 = 0.1;
 /// Height of a band of colour. [m]
 const BAND_M: f64 = 0.2;
 
 const _: () = assert!(NET_MIN_M.y == -NET_MAX_M.y);
 
-/// A person stays this far from the middle of what moves. [m]
+/// Distance of walks from the centre of moving objects. [m]
 const KEEP_OUT_M: f64 = 0.8;
 
 #[cfg(test)]
@@ -253,7 +253,7 @@ mod tests {
     use crate::canvas::Canvas;
     use vizflyt_arena::objects::MovingObjects;
 
-    /// Paints in plain light.
+    /// Generates an object in plain light.
     fn made(add: impl FnOnce(&mut Movers)) -> GeneratedMover {
         let mut movers = Movers::default();
         add(&mut movers);
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn splats_lie_on_the_true_faces_in_the_objects_own_frame() {
+    fn splats_lie_on_the_true_faces_in_the_object_frame() {
         for add in [
             |movers: &mut Movers| movers.add_door(3, 4.0),
             |movers: &mut Movers| movers.add_pendulum(3, 6.0),
@@ -283,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_that_moves_leaves_the_net() {
+    fn moving_objects_stay_in_the_net() {
         for seed in 0..10 {
             for add in [Movers::add_door, Movers::add_pendulum, Movers::add_drone] {
                 let GeneratedMover { config, truth, .. } = made(|movers| add(movers, seed, 5.5));

@@ -1,5 +1,5 @@
-//! Paints flat faces: a quadtree that is coarse where the texture is plain and fine along its
-//! edges, one Gaussian per cell.
+//! Painting of flat faces with one Gaussian per cell of a quadtree, which is coarse where the texture is uniform and
+//! fine along its edges.
 
 use glam::{DQuat, DVec2, DVec3};
 
@@ -7,31 +7,31 @@ use super::light::HallLight;
 use crate::canvas::{Canvas, Patch};
 use crate::random::Rng;
 
-/// What a texture shows at a point.
+/// Appearance of a texture at a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Look {
-    /// Share of light thrown back, linear.
+    /// Share of reflected light, linear.
     pub(crate) albedo: DVec3,
-    /// Light it gives off itself, linear.
+    /// Emitted light, linear.
     pub(crate) glow: DVec3,
 }
 
 impl Look {
-    /// A matt colour.
+    /// Returns a matt colour.
     pub(crate) fn matt(albedo: DVec3) -> Self {
         Self { albedo, glow: DVec3::ZERO }
     }
 
-    /// A lamp or a bright window.
+    /// Returns a lamp or a bright window.
     pub(crate) fn lamp(glow: DVec3) -> Self {
         Self { albedo: DVec3::splat(0.2), glow }
     }
 }
 
-/// A rectangle in space; its normal is `right x up`.
+/// Rectangle with the normal `right x up`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Panel {
-    /// The lower left corner. [m, world]
+    /// Lower left corner. [m, world]
     pub(crate) corner_m: DVec3,
     /// Unit direction of the width. [world]
     pub(crate) right: DVec3,
@@ -39,18 +39,18 @@ pub(crate) struct Panel {
     pub(crate) up: DVec3,
     /// Width and height. [m]
     pub(crate) size_m: DVec2,
-    /// How far inside the surface patches lie. [m]
+    /// Depth of patches below the surface. [m]
     pub(crate) inset_m: f64,
 }
 
-/// Greatest and least side of a cell. [m]
+/// Maximum and minimum side of a cell. [m]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Grain {
     pub(crate) coarse_m: f64,
     pub(crate) fine_m: f64,
 }
 
-/// Where everything in a hall is painted.
+/// Canvas and light of a hall.
 pub(crate) struct Painter<'a> {
     pub(crate) canvas: Canvas,
     pub(crate) rng: Rng,
@@ -58,8 +58,7 @@ pub(crate) struct Painter<'a> {
 }
 
 impl Painter<'_> {
-    /// Covers a panel with a texture, given in metres right and up from its corner; where the
-    /// texture is `None` there is a hole.
+    /// Covers a panel with a texture, in metres right and up from its corner; `None` is a hole.
     pub(crate) fn panel(
         &mut self,
         panel: &Panel,
@@ -77,8 +76,8 @@ impl Painter<'_> {
         }
     }
 
-    /// As [`Self::panel`], with large patches behind it that close the seams between cells. They
-    /// lie so deep that on a line of sight they come after the surface, and never blur it.
+    /// Same as [`Self::panel`], with large patches behind it that close the seams between cells. They are so deep that
+    /// they are behind the surface on any line of sight, and never blur it.
     pub(crate) fn backed_panel(
         &mut self,
         panel: &Panel,
@@ -123,7 +122,7 @@ impl Painter<'_> {
     ) {
         let middle_m = at_m + size_m / 2.0;
         if size_m.max_element() > fine_m * 1.5 && is_varied(panel, middle_m, size_m, texture) {
-            // Halve the long side of a slim cell, both sides of a square one.
+            // Halve only the long side of a slim cell, and both sides of a square cell.
             let split = DVec2::new(
                 if size_m.x * 1.5 > size_m.y { 2.0 } else { 1.0 },
                 if size_m.y * 1.5 > size_m.x { 2.0 } else { 1.0 },
@@ -152,8 +151,8 @@ impl Painter<'_> {
         });
     }
 
-    /// Covers the faces of a box, each as `texture(face, point)`; faces are -x, +x, -y, +y, -z,
-    /// +z of the box's own axes. `skip` leaves faces out.
+    /// Covers the faces of a box with `texture(face, point)`. Faces are -x, +x, -y, +y, -z, +z in the box's axes. Faces
+    /// in `skip` are omitted.
     pub(crate) fn cuboid(
         &mut self,
         block: &Block,
@@ -167,14 +166,14 @@ impl Painter<'_> {
     }
 }
 
-/// A box of any orientation.
+/// Box of any orientation.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Block {
     /// Centre. [m, world]
     pub(crate) center_m: DVec3,
     /// Half of each side. [m]
     pub(crate) half_m: DVec3,
-    /// Rotation of its axes into the world's.
+    /// Rotation from the box's axes to the world's.
     pub(crate) rotation: DQuat,
 }
 
@@ -188,7 +187,7 @@ impl Block {
         }
     }
 
-    /// Returns its solid.
+    /// Returns the solid.
     pub(crate) fn volume(&self) -> vizflyt_protocol::geometry::Volume {
         vizflyt_protocol::geometry::Volume::Cuboid {
             center_m: self.center_m,
@@ -197,16 +196,16 @@ impl Block {
         }
     }
 
-    /// Returns the point of a face in the box's own axes, from its centre. [m]
+    /// Returns a point of a face in the box's axes, from its centre. [m]
     pub(crate) fn local(&self, face: usize, p: DVec2) -> DVec3 {
         let panel = self.face(face);
         let at = panel.corner_m + panel.right * p.x + panel.up * p.y;
         self.rotation.conjugate() * (at - self.center_m)
     }
 
-    /// Returns a face seen from outside: -x, +x, -y, +y, -z, +z.
+    /// Returns a face as seen from outside: -x, +x, -y, +y, -z, +z.
     pub(crate) fn face(&self, face: usize) -> Panel {
-        // (outward, right, up) in the box's axes, right x up = outward.
+        // (Outward, right, up) in the box's axes, with right x up = outward.
         let (out, right, up) = match face {
             0 => (DVec3::NEG_X, DVec3::NEG_Y, DVec3::Z),
             1 => (DVec3::X, DVec3::Y, DVec3::Z),
@@ -227,8 +226,8 @@ impl Block {
     }
 }
 
-/// Whether the texture changes within a cell or close by: a large Gaussian bleeds over its cell,
-/// so that edges must be far from it.
+/// Whether the texture changes within a cell or near it. A large Gaussian extends beyond its cell, so it must not be
+/// near edges.
 fn is_varied(
     panel: &Panel,
     middle_m: DVec2,
@@ -243,7 +242,7 @@ fn is_varied(
             let offset = DVec2::new(f64::from(column), f64::from(row)) / 5.0 - 0.5;
             let p = (middle_m + offset * size_m * 1.5).clamp(DVec2::splat(1e-6), limit_m);
             if let Some(look) = texture(p) {
-                // Square roots stand for the eye.
+                // Square roots approximate perceived brightness.
                 let seen = look.albedo + look.glow;
                 let seen = DVec3::new(seen.x.sqrt(), seen.y.sqrt(), seen.z.sqrt());
                 low = low.min(seen);
@@ -257,15 +256,16 @@ fn is_varied(
     solid && (hole || (high - low).max_element() > CONTRAST)
 }
 
-/// A neighbour's middle is 1.75 deviations away: cells overlap enough to be opaque.
+/// Standard deviation relative to the side of a cell. The centre of a neighbour is 1.75 standard deviations away, so
+/// that cells overlap to an opaque surface.
 const SIGMA_PER_SIDE: f64 = 0.57;
-/// Patches lie this far inside a surface: their thickness. [m]
+/// Depth of patches below a surface, which is about their thickness. [m]
 pub(crate) const INSET_M: f64 = 0.003;
 /// Side of a patch behind a panel. [m]
 const BED_M: f64 = 0.4;
-/// How far behind. [m]
+/// Depth of these patches. [m]
 const BED_DEPTH_M: f64 = 0.42;
-/// Least difference of square roots of light that is an edge.
+/// Minimum difference of square roots of light for an edge.
 const CONTRAST: f64 = 0.13;
 
 #[cfg(test)]
@@ -273,7 +273,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn faces_look_outwards_and_lie_on_the_box() {
+    fn faces_lie_on_the_box_and_point_outwards() {
         let block = Block {
             center_m: DVec3::new(1.0, 2.0, 3.0),
             half_m: DVec3::new(0.5, 0.2, 0.1),

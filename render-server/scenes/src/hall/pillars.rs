@@ -1,4 +1,4 @@
-//! Pillars of foam blocks between start and goal: what a path is planned around.
+//! Pillars of foam blocks between start and goal, as obstacles for path planning.
 
 use glam::{DQuat, DVec2, DVec3};
 
@@ -8,7 +8,7 @@ use crate::canvas::paint;
 use crate::parts::{PartClass, Parts};
 use crate::random::{Rng, noise2};
 
-/// Upright boxes on the floor.
+/// Vertical boxes on the floor.
 #[derive(Debug, Default)]
 pub(crate) struct Pillars {
     seed: u64,
@@ -16,8 +16,8 @@ pub(crate) struct Pillars {
 }
 
 impl Pillars {
-    /// Draws the pillars of a seed: in every row across the net two, with a way beside and between
-    /// them, so that no straight line leads through all rows.
+    /// Draws the pillars of a seed: two in each row across the net, with free space next to and between them. No
+    /// straight line passes all rows.
     pub(crate) fn draw(seed: u64) -> Self {
         let mut rng = Rng::new(seed, 33);
         let mut pillars = Vec::new();
@@ -25,7 +25,7 @@ impl Pillars {
         let mut side = if rng.chance(0.5) { 1.0 } else { -1.0 };
         for row in 0..ROWS {
             let x_m = FIRST_M + PITCH_M * f64::from(row);
-            // One in the way of whoever comes straight, one towards a wall.
+            // One blocks the straight path, one is near a wall.
             for y_m in [side * rng.range(0.0, 0.25), -side * rng.range(1.35, 1.6)] {
                 let half_m = DVec2::new(rng.range(0.14, 0.24), rng.range(0.14, 0.24));
                 let top_m = if rng.chance(0.3) { rng.range(1.7, 2.0) } else { 3.2 };
@@ -46,12 +46,12 @@ impl Pillars {
         Self { seed, pillars }
     }
 
-    /// Returns its solids.
+    /// Returns the solids.
     pub(crate) fn blocks(&self) -> impl Iterator<Item = Block> {
         self.pillars.iter().map(|(block, _)| *block)
     }
 
-    /// Paints them: blocks of foam, stacked.
+    /// Paints the pillars as stacked blocks of foam.
     pub(crate) fn paint(&self, painter: &mut Painter, parts: &mut Parts) {
         for (n, (block, colour)) in self.pillars.iter().enumerate() {
             let seed = self.seed ^ (n as u64 * 131);
@@ -69,10 +69,10 @@ impl Pillars {
 }
 
 const ROWS: u32 = 4;
-/// The first row along x, and from row to row. [m]
+/// Position of the first row along x, and distance between rows. [m]
 const FIRST_M: f64 = 2.8;
 const PITCH_M: f64 = 1.9;
-/// Height of one block of foam. [m]
+/// Height of a block of foam. [m]
 const LAYER_M: f64 = 0.4;
 
 #[cfg(test)]
@@ -81,7 +81,7 @@ mod tests {
     use vizflyt_protocol::geometry::Volume;
 
     #[test]
-    fn there_is_a_way_but_no_straight_one() {
+    fn there_is_a_path_but_no_straight_one() {
         for seed in 0..50 {
             let pillars = Pillars::draw(seed);
             let volumes: Vec<Volume> = pillars.blocks().map(|block| block.volume()).collect();
@@ -90,7 +90,7 @@ mod tests {
             };
             let straight = (0..=200).map(|n| DVec3::new(0.9 + 0.047 * f64::from(n), 0.0, 1.2));
             assert!(straight.map(clearance_m).fold(f64::MAX, f64::min) < 0.12, "seed {seed}");
-            // Each row has a place to pass.
+            // Each row has free space to pass.
             for row in 0..ROWS {
                 let x_m = FIRST_M + PITCH_M * f64::from(row);
                 let across = (-40..=40).map(|n| DVec3::new(x_m, 0.05 * f64::from(n), 1.2));

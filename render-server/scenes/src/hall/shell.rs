@@ -1,5 +1,5 @@
-//! The hall about the net: floor, walls with windows and posters, ceiling with tubes, truss and net;
-//! [`super::furniture`] stands in it. The same for `room` and `race`, but for colours and posters by seed.
+//! Hall around the net: floor, walls with windows and posters, ceiling with tubes, truss and net; the furniture is in
+//! [`super::furniture`]. It is the same for `room` and `race`; colours and posters depend on the seed.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::Volume;
@@ -13,7 +13,7 @@ use super::texture;
 use crate::canvas::{Patch, paint};
 use crate::random::{fractal2, noise2, smoothstep};
 
-/// The hall of a seed.
+/// Hall of a seed.
 pub(crate) struct Shell {
     seed: u64,
     furniture: Furniture,
@@ -44,7 +44,7 @@ impl Shell {
         volumes
     }
 
-    /// Returns the boxes whose shadows are seen.
+    /// Returns the boxes that cast visible shadows.
     pub(crate) fn casters(&self) -> Vec<Volume> {
         self.furniture.casters()
     }
@@ -70,7 +70,7 @@ impl Shell {
         let inside = floor_panel(a.truncate(), b.truncate());
         let grain = Grain { coarse_m: 0.095, fine_m: 0.04 };
         painter.backed_panel(&inside, grain, &|p| Some(Look::matt(mats(p + a.truncate()))));
-        // Polished concrete about it, with yellow tape along the net.
+        // Polished concrete around it, with yellow tape along the net.
         let seed = self.seed;
         let concrete = move |at: DVec2| {
             let stain = fractal2(seed ^ 0x31, at / 1.9, 4);
@@ -134,7 +134,7 @@ impl Shell {
     }
 }
 
-/// Returns the walls without windows: a point at the floor, the inward normal, and the reach to both sides. [m, world]
+/// Returns the walls without windows: a point at the floor, the inward normal, and the extent to both sides. [m, world]
 pub(crate) fn walls() -> [(DVec3, DVec3, f64); 3] {
     let middle = (HALL_MIN_M + HALL_MAX_M) / 2.0;
     let half = (HALL_MAX_M - HALL_MIN_M) / 2.0 - 0.4;
@@ -145,10 +145,10 @@ pub(crate) fn walls() -> [(DVec3, DVec3, f64); 3] {
     ]
 }
 
-/// Returns a level panel that looks up. [m, world]
+/// Returns a horizontal panel that faces up. [m, world]
 pub(crate) fn floor_panel(min: DVec2, max: DVec2) -> Panel {
-    // At a grazing angle a pixel takes the depth of the nearest patch that covers it: two
-    // centimetres down, the floor is seen where it is.
+    // At a grazing angle, a pixel has the depth of the nearest patch that covers it. With patches 2 cm below, the
+    // rendered floor is at its true height.
     Panel {
         corner_m: min.extend(0.0),
         right: DVec3::X,
@@ -158,7 +158,7 @@ pub(crate) fn floor_panel(min: DVec2, max: DVec2) -> Panel {
     }
 }
 
-/// Posts and rails that carry the net, just outside it.
+/// Returns the posts and rails that carry the net, just outside of it.
 fn truss() -> Vec<Block> {
     let half_m = 0.055;
     let (a, b) = (NET_MIN_M - 0.14, NET_MAX_M + 0.14);
@@ -197,7 +197,7 @@ fn paint_ceiling(painter: &mut Painter) {
         if lamp {
             return Some(Look::lamp(DVec3::new(1.7, 1.68, 1.6)));
         }
-        // Trapezoidal sheet between steel beams.
+        // Trapezoidal sheets between steel beams.
         let beam = (at.x / 2.83 - (at.x / 2.83).round()).abs() * 2.83 < 0.12;
         let rib = smoothstep(0.3, 0.5, (at.y / 0.9 - (at.y / 0.9).round()).abs());
         Some(Look::matt(if beam {
@@ -208,8 +208,8 @@ fn paint_ceiling(painter: &mut Painter) {
     });
 }
 
-/// Thin, see-through strands on all sides of the flight space and above it. Fainter than what
-/// counts as an obstacle: the fence keeps vehicles off the net.
+/// Paints the net: thin, translucent strands on all sides of the flight space and above it. They are too faint to count
+/// as obstacles, because the fence keeps vehicles away from the net.
 fn paint_net(painter: &mut Painter) {
     let (a, b) = (NET_MIN_M - 0.05, NET_MAX_M + 0.05);
     let mut strand = |from_m: DVec3, to_m: DVec3| {
@@ -255,5 +255,5 @@ fn paint_net(painter: &mut Painter) {
     }
 }
 
-/// Mesh width of the net; wider than real nets, so that it stays a net at 320 pixels. [m]
+/// Mesh width of the net, wider than in real nets so that it is visible at 320 pixels. [m]
 const NET_PITCH_M: f64 = 0.31;

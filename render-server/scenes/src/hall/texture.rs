@@ -1,4 +1,4 @@
-//! Textures of the hall: painted walls, posters, screens, the view outside, racing colours.
+//! Textures of the hall: painted walls, posters, screens, view through windows, bricks.
 
 use glam::{DVec2, DVec3};
 
@@ -23,7 +23,7 @@ pub(crate) fn wall(seed: u64, p: DVec2) -> DVec3 {
     base * stain * if seam { 0.72 } else { 1.0 }
 }
 
-/// Returns the wall with what hangs on it; `side` distinguishes walls.
+/// Returns the wall with its posters, boards and doors; `side` is the number of the wall.
 pub(crate) fn with_pictures(seed: u64, side: u64, p: DVec2) -> Look {
     for (n, picture) in pictures(side).iter().enumerate() {
         let (min, size) = (DVec2::new(picture.x_m, picture.y_m), picture.size_m);
@@ -44,7 +44,7 @@ pub(crate) fn with_pictures(seed: u64, side: u64, p: DVec2) -> Look {
     Look::matt(wall(seed, p))
 }
 
-/// What hangs on a wall.
+/// Kind of object on a wall.
 #[derive(Clone, Copy, Debug)]
 enum Hanging {
     Poster,
@@ -111,7 +111,7 @@ fn poster(key: u64, q: DVec2, edge_m: f64) -> DVec3 {
     if edge_m < 0.03 {
         return paint(0xf0eee8);
     }
-    // A title, a shape, and lines of text below.
+    // A title, a shape, and lines of text.
     if q.y > 0.84 && q.y < 0.93 && q.x > 0.1 && q.x < rng.range(0.6, 0.9) {
         return ink[1];
     }
@@ -193,7 +193,7 @@ fn banner(key: u64, q: DVec2) -> DVec3 {
     paint(if lit { front } else { back })
 }
 
-/// Returns what a monitor shows: windows of a desktop with plots.
+/// Returns the content of a monitor: windows with plots.
 pub(crate) fn screen(key: u64, q: DVec2) -> Look {
     let edge = q.min(DVec2::ONE - q).min_element();
     if edge < 0.035 {
@@ -214,7 +214,7 @@ pub(crate) fn screen(key: u64, q: DVec2) -> Look {
     Look { albedo: DVec3::splat(0.03), glow: colour * 1.1 }
 }
 
-/// Returns the light seen through a window: sky above trees and lawn.
+/// Returns the light through a window: sky above trees and lawn.
 pub(crate) fn outside(seed: u64, p: DVec2) -> DVec3 {
     let crown_m = 2.1 + 0.9 * fractal2(seed ^ 0x61, DVec2::new(p.x / 1.1, 0.0), 3);
     let leaf = fractal2(seed ^ 0x62, p / 0.32, 2);
@@ -229,7 +229,7 @@ pub(crate) fn outside(seed: u64, p: DVec2) -> DVec3 {
     }
 }
 
-/// Returns the colour of a gap's wall: bricks with a spray-painted field.
+/// Returns the colour of the wall with a gap: bricks with spray paint.
 pub(crate) fn bricks(seed: u64, p: DVec2) -> DVec3 {
     let course = (p.y / 0.16).floor();
     let shift = if course as i64 % 2 == 0 { 0.0 } else { 0.17 };

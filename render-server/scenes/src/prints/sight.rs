@@ -1,4 +1,4 @@
-//! What a walk sees of a print.
+//! Visibility of prints from a walk.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Pose, World};
@@ -7,7 +7,7 @@ use super::Print;
 use crate::solids::Solids;
 use crate::walk::Walk;
 
-/// The camera at one instant of a walk.
+/// Camera at an instant of a walk.
 pub(super) struct Glimpse {
     pub(super) world_from_cam: Pose<World, Cam>,
 }
@@ -19,7 +19,7 @@ pub(super) fn glimpses(walk: &Walk) -> Vec<Glimpse> {
     (0..count as usize).map(|n| Glimpse { world_from_cam: walk.world_from_cam(at(n)) }).collect()
 }
 
-/// Returns where the walker is, densely. [m, world]
+/// Returns dense positions of the walker. [m, world]
 pub(super) fn way_m(walk: &Walk) -> Vec<DVec2> {
     let count = (walk.length_m() / 0.2).ceil().max(8.0);
     let at = |n: usize| walk.world_from_cam(walk.seconds() * n as f64 / count);
@@ -27,7 +27,7 @@ pub(super) fn way_m(walk: &Walk) -> Vec<DVec2> {
 }
 
 impl Glimpse {
-    /// Whether a phone sees all of a print, large and plain enough to be read.
+    /// Whether a phone sees a complete print, large enough and from a suitable angle to be read.
     pub(super) fn sees(&self, print: &Print, solids: &Solids) -> bool {
         let eye_m = self.world_from_cam.translation_m;
         let pose = print.world_from_print;
@@ -52,13 +52,12 @@ impl Glimpse {
     }
 }
 
-/// Whether nothing solid is between a point of a surface and another point: steps by the distance to what is nearest (sphere
-/// tracing, Hart 1996).
+/// Whether no solid is between a point on a surface and another point. Uses sphere tracing (Hart 1996).
 fn is_clear(solids: &Solids, from_m: DVec3, to_m: DVec3) -> bool {
     let way = to_m - from_m;
     let length_m = way.length();
     let toward = way / length_m;
-    // Out of the board's own wall first.
+    // Start outside of the board's wall.
     let mut along_m = 0.08;
     while along_m < length_m {
         let free_m = solids.distance_to_bodies_m(from_m + toward * along_m);
@@ -70,12 +69,12 @@ fn is_clear(solids: &Solids, from_m: DVec3, to_m: DVec3) -> bool {
     true
 }
 
-/// Between glimpses. [s]
+/// Time between glimpses. [s]
 const GLIMPSE_S: f64 = 0.4;
-/// From here to there a tag of 0.24 m is 20 to 120 px in an image 640 px wide. [m]
+/// Distance range in which a tag of 0.24 m has 120 to 20 px in an image of 640 px width. [m]
 const NEAR_M: f64 = 0.9;
 const FAR_M: f64 = 4.6;
-/// Cosine of the steepest angle at which it is read: 60 degrees.
+/// Cosine of the maximum viewing angle for reading a tag: 60 degrees.
 const FACING: f64 = 0.5;
-/// Well within a phone's image, whatever its lens.
+/// Limits of the slopes that are well within a phone's image for all lenses.
 const SLOPES: DVec2 = DVec2::new(0.56, 0.40);

@@ -1,4 +1,4 @@
-//! Boards stand free, are seen, and the renderer sees them where they are.
+//! Properties of boards: free of obstacles, visible from the walk, and rendered at their true positions.
 
 use vizflyt_splat::{CpuRenderer, Rasterizer, RgbdImage, Scene};
 
@@ -13,7 +13,7 @@ fn boards_touch_nothing_and_leave_the_course_free() {
             let set = film_set(kind, seed, 50.0, true).unwrap();
             let plain = generate(kind, seed);
             assert!(set.prints.len() >= 8, "{kind} {seed}: {} boards", set.prints.len());
-            // What stood there still does; boards come after it.
+            // All previous solids are still there; boards follow after them.
             let (before, boards) = set.scene.truth.split_at(plain.truth.len());
             assert_eq!(before, plain.truth);
             assert_eq!(set.scene.splats.sh_degree, 0);
@@ -24,7 +24,7 @@ fn boards_touch_nothing_and_leave_the_course_free() {
                 let pose = print.world_from_print;
                 let half = print.side_m / 2.0;
                 for (x, y) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (0.0, 0.0)] {
-                    // Before the sheet, and behind its board.
+                    // In front of the sheet, and inside of the board.
                     for z in [0.05, -0.5 * THICK_M] {
                         let p_m = pose.transform_point(DVec3::new(x * half, y * half, z));
                         let free = before.iter().map(|volume| volume.signed_distance_m(p_m));
@@ -45,9 +45,9 @@ fn boards_touch_nothing_and_leave_the_course_free() {
     }
 }
 
-/// Where a board fills a pixel, the rendered depth is the board's: nothing soft hides it, neither the net nor plants.
+/// In pixels of a board, the rendered depth must be that of the board, so that neither net nor plants hide it.
 #[test]
-fn the_walk_sees_the_boards_where_they_are() {
+fn the_walk_sees_the_boards_at_their_true_positions() {
     for kind in [SceneKind::Room, SceneKind::Forest, SceneKind::Race] {
         let set = film_set(kind, 3, 50.0, true).unwrap();
         let film = Film::new(Phone::draw(kind, 3, 320, 240));
@@ -70,7 +70,7 @@ fn the_walk_sees_the_boards_where_they_are() {
             renderer.render(&placements, &[camera], &mut images).unwrap();
             for n in of {
                 seen[n] += 1;
-                // Within the black square; edges are soft.
+                // Points within the black square, because edges are soft.
                 for (x, y) in [(-0.6, -0.6), (0.6, -0.6), (0.6, 0.6), (-0.6, 0.6), (0.0, 0.0)] {
                     let half = set.prints[n].side_m / 2.0;
                     let p = DVec3::new(x * half, y * half, 0.0);

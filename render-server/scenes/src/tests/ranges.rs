@@ -1,4 +1,4 @@
-//! What a LiDAR measures in the splats of generated scenes, against rays cast at their true geometry.
+//! Compares LiDAR ranges in the splats of generated scenes with rays cast at their true geometry.
 
 use vizflyt_protocol::geometry::Sensor;
 use vizflyt_splat::sensor::{
@@ -7,17 +7,17 @@ use vizflyt_splat::sensor::{
 
 use super::*;
 
-/// How far ranges stray from the truth, of beams that meet it within 20 m inside a volume.
+/// Range errors of beams that hit the true geometry within 20 m inside a volume.
 #[derive(Debug, Default)]
 struct Strayed {
-    /// Errors of range on obstacles: trunks, logs, boulders, walls, frames. [m]
+    /// Range errors on obstacles: trunks, logs, boulders, walls, frames. [m]
     obstacles_m: Vec<f64>,
     /// Distances of points from the floor. [m]
     floor_m: Vec<f64>,
     lost: usize,
 }
 
-/// A VLP-16 without noise, of 1024 columns, and its 16 elevations.
+/// Returns a VLP-16 without noise, with 1024 columns, and its 16 elevations.
 fn exact() -> (LidarModel, Vec<f32>) {
     let model =
         LidarModel { sigma_m: 0.0, range_step_m: 0.0, min_range_m: 0.0, ..presets::vlp_16() };
@@ -26,7 +26,7 @@ fn exact() -> (LidarModel, Vec<f32>) {
     (model, elevations_rad)
 }
 
-/// Returns how far along a ray the truth is, and whether that is the floor.
+/// Returns the distance along a ray to the true geometry, and whether it is the floor.
 fn cast(solids: &Solids, within: &Volume, p_m: DVec3, ray: DVec3) -> Option<(f64, bool)> {
     let mut along_m = 0.0;
     for _ in 0..600 {
@@ -62,7 +62,7 @@ fn measure(scene: &Generated, within: &Volume, places: &[DVec3]) -> Strayed {
                 cast(&solids, within, p_m, level.extend(elevation.sin()))
             };
             let Some((truth_m, floor)) = beam(0.0, 0.0) else { continue };
-            // Beams over an outline, by two deviations of their footprint, see both sides.
+            // Beams within two standard deviations of their footprint from an outline hit both sides.
             let edge = 1.5e-3;
             let outline =
                 [(edge, 0.0), (-edge, 0.0), (0.0, edge), (0.0, -edge)].iter().any(|&(l, u)| {
@@ -88,7 +88,7 @@ fn measure(scene: &Generated, within: &Volume, places: &[DVec3]) -> Strayed {
     strayed
 }
 
-/// Returns the value that this share of all is below.
+/// Returns the quantile of a share.
 fn quantile(values: &mut [f64], share: f64) -> f64 {
     values.sort_by(f64::total_cmp);
     values[((values.len() - 1) as f64 * share) as usize]
@@ -106,7 +106,7 @@ fn check(name: &str, mut strayed: Strayed) {
     );
     assert!(obstacles > 500, "{name}");
     assert!(median <= 0.01 && most <= 0.03, "{name}: {median} {most}");
-    // The floor is painted some centimetres below where it is, for images, which take a splat's depth at its centre.
+    // The floor is painted some centimetres below its true height, because images use the depth of a splat's centre.
     assert!(floor <= 0.03 && most_floor <= 0.06, "{name}: {floor} {most_floor}");
     assert!(
         strayed.lost * 100 <= obstacles + strayed.floor_m.len(),

@@ -1,8 +1,8 @@
-//! A closed way over free floor.
+//! Planner of a closed path over the free floor.
 //!
-//! The floor is a grid; a cell is free where a person fits between the true solids. Corners of a rectangle within the
-//! fence, moved to the nearest free floor that can be reached, are joined by shortest ways that like to keep away from things
-//! (Dijkstra 1959), and the whole is smoothed.
+//! The floor is a grid. A cell is free if a person fits between the true solids. The corners of a rectangle within the
+//! fence are moved to the nearest reachable free cells and connected by shortest paths with a cost near obstacles
+//! (Dijkstra 1959). The result is smoothed.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
@@ -12,20 +12,19 @@ use vizflyt_protocol::geometry::Volume;
 
 use crate::solids::Solids;
 
-/// Where one may walk.
+/// Walkable ground.
 pub(crate) struct Ground<'a> {
-    /// What stands there.
+    /// Solids of the scene.
     pub(crate) solids: &'a Solids,
-    /// What is not to be walked into, besides.
+    /// Additional volumes to avoid.
     pub(crate) keep_out: &'a [Volume],
-    /// The floor that may be walked on. [m, world]
+    /// Walkable floor. [m, world]
     pub(crate) floor_m: [DVec2; 2],
-    /// The floor to be filmed. [m, world]
+    /// Floor area to capture. [m, world]
     pub(crate) within_m: [DVec2; 2],
 }
 
-/// Returns a closed way of about this length; once around, or more often where the ground is small.
-/// `None` without free floor.
+/// Returns a closed path of about this length, with several laps if the ground is small. `None` without free floor.
 pub(super) fn closed_way(ground: &Ground<'_>, wanted_m: f64) -> Option<Vec<DVec2>> {
     let grid = Grid::new(ground);
     let around = |share: f64, shift: f64| {
@@ -38,7 +37,7 @@ pub(super) fn closed_way(ground: &Ground<'_>, wanted_m: f64) -> Option<Vec<DVec2
         let laps = laps as usize;
         return Some((0..laps).flat_map(|_| whole.iter().copied()).collect());
     }
-    // A smaller rectangle, found by halving; where its middle is in a wall it is a long way round, and another place is better.
+    // Find a smaller rectangle by bisection. If a wall is in its middle, the path is long, and another place is better.
     let mut best: Option<Vec<DVec2>> = None;
     let mut shortest = whole;
     for shift in SHIFTS {
@@ -66,7 +65,7 @@ pub(super) fn closed_way(ground: &Ground<'_>, wanted_m: f64) -> Option<Vec<DVec2
     Some(best.unwrap_or(shortest))
 }
 
-/// Returns points at even distances along a closed way.
+/// Returns points at even distances along a closed path.
 pub(super) fn evenly(way: &[DVec2], step_m: f64) -> Vec<DVec2> {
     let total_m = length_m(way);
     let count = ((total_m / step_m).round() as usize).max(8);
@@ -89,18 +88,18 @@ pub(super) fn evenly(way: &[DVec2], step_m: f64) -> Vec<DVec2> {
     points
 }
 
-/// Returns the length of a closed way. [m]
+/// Returns the length of a closed path. [m]
 pub(super) fn length_m(way: &[DVec2]) -> f64 {
     (0..way.len()).map(|n| (way[(n + 1) % way.len()] - way[n]).length()).sum()
 }
 
-/// Corners, and points between them, of a rectangle within what is filmed: of this share of its length, and shifted by a share of
-/// what it is shorter.
+/// Returns the corners of a rectangle within the captured area, and points between them. `share` is its relative
+/// length, `shift` its offset relative to the remaining length.
 fn rectangle(ground: &Ground<'_>, share: f64, shift: f64) -> Vec<DVec2> {
     let [low, high] = ground.within_m;
     let middle = (low + high) / 2.0;
     let half = ((high - low) / 2.0 - ASIDE_M).max(DVec2::splat(0.5));
-    // The long side first: a short walk in a long place sees all of its width.
+    // Only the long side is reduced, so that a short walk in a long place still covers its width.
     let long = half.max_element();
     let whole = half;
     let half = half.min(DVec2::splat((long * share).max(0.25)));
@@ -122,7 +121,7 @@ fn rectangle(ground: &Ground<'_>, share: f64, shift: f64) -> Vec<DVec2> {
     points
 }
 
-/// Rounds corners as one walks them: a Gaussian along the closed way.
+/// Rounds corners with a Gaussian along the closed path.
 fn smooth(way: &[DVec2]) -> Vec<DVec2> {
     let count = way.len() as isize;
     let reach = ((3.0 * ROUND_M / SPACING_M) as isize).min(count / 2);
@@ -139,12 +138,12 @@ fn smooth(way: &[DVec2]) -> Vec<DVec2> {
     (0..count).map(at).collect()
 }
 
-/// Floor in cells.
+/// Grid of the floor.
 struct Grid {
     low_m: DVec2,
     columns: usize,
     rows: usize,
-    /// What a step onto it costs; infinite where nobody fits.
+    /// Cost of each cell; infinite where a person does not fit.
     costs: Vec<f64>,
 }
 
@@ -172,7 +171,7 @@ impl Grid {
         Self { low_m, columns, rows, costs }
     }
 
-    /// Returns the closed way by all of these points, each moved to where the first one's floor is.
+    /// Returns the closed path through all points, each moved to the nearest cell that is reachable from the first one.
     fn joined(&self, points: &[DVec2]) -> Option<Vec<DVec2>> {
         let reachable = self.search(self.nearest(points[0], |_| true)?, None);
         let cells: Vec<usize> = points
@@ -182,7 +181,7 @@ impl Grid {
         let mut way = Vec::new();
         for n in 0..cells.len() {
             let (from, to) = (cells[n], cells[(n + 1) % cells.len()]);
-            // Backwards, so that it comes out in order.
+            // Search backwards, so that the path is in order.
             let search = self.search(to, Some(from));
             let mut cell = from;
             while cell != to {
@@ -201,7 +200,7 @@ impl Grid {
         self.low_m + (at + 0.5) * CELL_M
     }
 
-    /// Returns the free cell nearest to a point, among those allowed.
+    /// Returns the nearest free and allowed cell to a point.
     fn nearest(&self, p_m: DVec2, allowed: impl Fn(usize) -> bool) -> Option<usize> {
         (0..self.costs.len()).filter(|&cell| self.costs[cell].is_finite() && allowed(cell)).min_by(
             |&a, &b| {
@@ -211,7 +210,7 @@ impl Grid {
         )
     }
 
-    /// Searches from a cell, everywhere or until another is reached.
+    /// Searches all cells from a start, or until `until` is reached.
     fn search(&self, start: usize, until: Option<usize>) -> Search {
         let mut search = Search {
             costs: vec![f64::INFINITY; self.costs.len()],
@@ -253,7 +252,7 @@ struct Search {
     before: Vec<Option<usize>>,
 }
 
-/// The cheapest comes first; of equal ones the first cell, so that the order is always the same.
+/// Entry of the queue: lowest cost first, ties by cell index, so that the order is deterministic.
 #[derive(PartialEq)]
 struct Open {
     cost: f64,
@@ -276,21 +275,21 @@ impl PartialOrd for Open {
 
 const NEIGHBOURS: [(isize, isize); 8] =
     [(-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)];
-/// Where a shorter rectangle is tried, until the way is nearly as long as wanted.
+/// Tested offsets of a shorter rectangle, until the path has nearly the wanted length.
 const SHIFTS: [f64; 5] = [0.0, -0.4, 0.4, -0.8, 0.8];
 /// Side of a cell. [m]
 const CELL_M: f64 = 0.1;
-/// Heights at which a person must fit; a twig on the floor is stepped over. [m]
+/// Heights at which a person must fit; a person can step over a twig on the floor. [m]
 const HEIGHTS_M: [f64; 5] = [0.35, 0.75, 1.15, 1.55, 1.9];
-/// Half a person's width with arms, and what corners lose by being rounded. [m]
+/// Half the width of a person with arms, plus the deviation at rounded corners. [m]
 const BODY_M: f64 = 0.42;
-/// Room that people like to have. [m]
+/// Preferred distance from obstacles. [m]
 const ELBOW_M: f64 = 0.8;
-/// How far from the border of what is filmed one walks. [m]
+/// Distance of the path from the border of the captured area. [m]
 const ASIDE_M: f64 = 0.9;
-/// Places by which the way leads. [m]
+/// Distance between the waypoints. [m]
 const BETWEEN_M: f64 = 3.0;
-/// Corners are rounded over this distance, one standard deviation. [m]
+/// Standard deviation of the smoothing at corners. [m]
 const ROUND_M: f64 = 0.35;
-/// Points while it is rounded. [m]
+/// Distance between points for the smoothing. [m]
 const SPACING_M: f64 = 0.05;

@@ -1,10 +1,10 @@
-//! What a walking person's hand does to a phone: steps, slow wandering, tremor; all sums of sines.
+//! Motion of a phone in the hand of a walking person: steps, slow drift and tremor, all as sums of sines.
 
 use core::f64::consts::TAU;
 
 use crate::random::Rng;
 
-/// The sway of one walk.
+/// Sway of a walk.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Sway {
     height_m: Vec<Wave>,
@@ -14,20 +14,20 @@ pub(super) struct Sway {
     roll_rad: Vec<Wave>,
 }
 
-/// The sway at an instant.
+/// Sway at a time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Swayed {
-    /// Of the camera above the floor. [m]
+    /// Height of the camera above the floor. [m]
     pub(super) height_m: f64,
-    /// To the left of the way. [m]
+    /// Offset to the left of the path. [m]
     pub(super) aside_m: f64,
     pub(super) yaw_rad: f64,
-    /// Upwards.
+    /// Pitch, upwards.
     pub(super) pitch_rad: f64,
     pub(super) roll_rad: f64,
 }
 
-/// A sine with a whole number of periods in the walk.
+/// Sine with an integer number of periods in the walk.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Wave {
     amplitude: f64,
@@ -38,9 +38,9 @@ struct Wave {
 impl Sway {
     /// Draws the sway of a walk of this duration.
     ///
-    /// A walking person takes about two steps a second: the body rises twice a second and leans once a second, by some
-    /// centimetres; a hand that holds something still wanders slowly by a degree or two and trembles at 4 to 10 Hz by
-    /// about a tenth of one (Elble and Koller, Tremor, 1990).
+    /// A walking person takes about two steps per second: the body rises at 2 Hz and leans at 1 Hz, by some
+    /// centimetres. A hand that holds an object drifts slowly by one or two degrees, and has a tremor of about 0.1
+    /// degrees at 4 to 10 Hz (Elble and Koller, Tremor, 1990).
     pub(super) fn draw(rng: &mut Rng, seconds: f64) -> Self {
         let cadence_hz = rng.range(1.7, 1.95);
         let mut wave = |amplitude: f64, hz: f64| Wave {
@@ -51,7 +51,7 @@ impl Sway {
         let degrees = 1f64.to_radians();
         let once = 1.0 / seconds;
         Self {
-            // Held higher on one half of the way than on the other.
+            // Higher on one half of the path than on the other.
             height_m: vec![wave(0.14, once), wave(0.012, cadence_hz)],
             aside_m: vec![wave(0.018, cadence_hz / 2.0), wave(0.02, 0.23)],
             yaw_rad: vec![
@@ -92,7 +92,7 @@ impl Sway {
     }
 }
 
-/// Height at which a phone is held before the chest. [m]
+/// Height of a phone that is held in front of the chest. [m]
 const EYE_M: f64 = 1.42;
-/// Mostly a little downwards: the floor tells where down is. [rad]
+/// Mean pitch, slightly downwards, so that images show the floor, which defines the vertical axis. [rad]
 const PITCH_RAD: f64 = -0.09;

@@ -1,11 +1,12 @@
-//! Walks are walked: closed, clear of everything, at a person's pace, with a gaze that turns no faster than SfM follows.
+//! Properties of walks: closed, free of obstacles, at walking speed, with rotations that structure from motion
+//! tolerates.
 
 use super::*;
 use crate::{SceneKind, film_set};
 use vizflyt_protocol::geometry::Volume;
 
 #[test]
-fn walks_are_closed_free_and_no_faster_than_people() {
+fn walks_are_closed_and_free_at_walking_speed() {
     for kind in SceneKind::ALL {
         for (seed, seconds) in [(3, 50.0), (7, 20.0), (1, 90.0)] {
             let set = film_set(kind, seed, seconds, true).unwrap();
@@ -35,7 +36,7 @@ fn walks_are_closed_free_and_no_faster_than_people() {
             assert!(nearest_m > 0.22, "{about}: {nearest_m} m from something");
             assert!(fastest_mps < 2.0, "{about}: {fastest_mps} m/s");
             assert!(fastest_radps < 100f64.to_radians(), "{about}: {fastest_radps} rad/s");
-            // The seam is no jump.
+            // There is no jump between end and start.
             let [end, begin] = [seconds - 1e-6, seconds + 1e-6].map(|at| walk.world_from_cam(at));
             assert!((end.translation_m - begin.translation_m).length() < 1e-4, "{about}");
             assert!(end.rotation.angle_between(begin.rotation) < 1e-4, "{about}");
@@ -44,19 +45,19 @@ fn walks_are_closed_free_and_no_faster_than_people() {
 }
 
 #[test]
-fn a_seed_gives_the_same_walk_and_another_a_different_one() {
+fn the_seed_determines_the_walk() {
     let walk = |seed| film_set(SceneKind::Room, seed, 10.0, true).unwrap().walk;
     assert_eq!(walk(4), walk(4));
     assert_ne!(walk(4), walk(5));
 }
 
 #[test]
-fn a_walk_without_time_or_floor_is_refused() {
+fn rejects_invalid_durations_and_missing_floor() {
     for seconds in [0.0, 1.9, -3.0, 601.0, f64::NAN, f64::INFINITY] {
         let error = film_set(SceneKind::Room, 3, seconds, false).unwrap_err().to_string();
         assert!(error.contains("2 to 600 s"), "{error}");
     }
-    // All of the floor is under a block.
+    // A block covers the whole floor.
     let solids = crate::solids::Solids::new(vec![Volume::aabb(
         DVec3::new(-5.0, -5.0, 0.0),
         DVec3::new(5.0, 5.0, 3.0),
@@ -67,7 +68,7 @@ fn a_walk_without_time_or_floor_is_refused() {
 }
 
 #[test]
-fn the_shortest_walk_is_one() {
+fn plans_a_walk_of_the_minimum_duration() {
     let set = film_set(SceneKind::Room, 3, 2.0, true).unwrap();
     assert!(set.walk.length_m() < 4.0, "{} m", set.walk.length_m());
 }

@@ -1,4 +1,4 @@
-//! Holds a method of collision detection against the true geometry of a generated scene.
+//! Compares a method of collision detection with the true geometry of a generated scene.
 
 #![allow(dead_code)] // Why: test and bench use different parts.
 
@@ -11,37 +11,37 @@ use vizflyt_protocol::geometry::Volume;
 use vizflyt_scenes::Generated;
 use vizflyt_splat::Splats;
 
-/// Radius of the body that touches or does not. [m]
+/// Radius of the tested body. [m]
 pub(crate) const BODY_M: f64 = 0.12;
 
-/// Above the litter, and below the forest's crowns, whose leaves are splats and no true solids. In a
-/// hall, all there is. [m, world]
+/// Heights above the litter and below the crowns of the forest, which have leaves that are not true solids. In a hall,
+/// this includes everything. [m, world]
 pub(crate) const FLOWN_M: Range<f64> = FLOOR_BAND_M + BODY_M..3.0;
-/// The forest's crowns: twigs, some thinner than a voxel, among leaves. [m, world]
+/// Heights of the forest's crowns: twigs, some of them thinner than a voxel, between leaves. [m, world]
 pub(crate) const CROWNS_M: Range<f64> = 3.0..4.0;
 
-/// Near enough to a solid to matter. [m]
+/// Maximum distance of tested positions from a solid. [m]
 const NEAR_M: f64 = 0.6;
 
-/// Where a body could be, and how far the nearest true surface is from there.
+/// Positions of the body, with the distance to the nearest true surface.
 pub(crate) struct Places(Vec<(DVec3, f64)>);
 
-/// How verdicts compare.
+/// Comparison of verdicts with the truth.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Score {
-    /// Places where the body reaches more than the tolerance into something.
+    /// Number of positions with a penetration above the tolerance.
     pub touching: usize,
-    /// Of these, not detected.
+    /// Number of these that were not detected.
     pub missed: usize,
-    /// Places where it is free by more than the other tolerance.
+    /// Number of positions with a clearance above the other tolerance.
     pub clear: usize,
-    /// Of these, reported as contact.
+    /// Number of these that were reported as contact.
     pub alarms: usize,
 }
 
 impl Places {
-    /// Draws places within the fence, outside of everything, and near enough to something to matter,
-    /// at heights where the body is clear of the band of litter, which is floor. [m, world]
+    /// Draws positions within the fence, outside of solids but near one. At these heights, the body is above the band
+    /// of litter, which counts as floor. [m, world]
     pub(crate) fn draw(scene: &Generated, heights: &Range<f64>, count: usize, seed: u64) -> Self {
         let solids: Vec<_> =
             scene.truth.iter().filter(|v| !matches!(v, Volume::HalfSpace { .. })).collect();
@@ -52,9 +52,9 @@ impl Places {
             (state >> 11) as f64 / (1u64 << 53) as f64
         };
         let mut places = Vec::with_capacity(count);
-        // Bounded: in an empty room there may be nothing near.
+        // Bounded, because there may be no near solid in an empty room.
         for _ in 0..1000 * count {
-            // About any solid: most of a forest is air.
+            // Positions are drawn around solids, because most of a forest is air.
             let solid = solids[(next() * solids.len() as f64) as usize];
             let (t, aside) = (next(), DVec3::new(next(), next(), next()) * 2.0 - 1.0);
             let p = match *solid {
@@ -81,8 +81,8 @@ impl Places {
         Self(places)
     }
 
-    /// Judges verdicts: misses count beyond `deep_m` of penetration, false alarms beyond `free_m`
-    /// of clearance.
+    /// Counts errors of verdicts: misses with a penetration above `deep_m`, false alarms with a clearance above
+    /// `free_m`.
     pub(crate) fn judge(
         &self,
         deep_m: f64,
@@ -117,7 +117,7 @@ impl Score {
     }
 }
 
-/// Bakes a scene by its arena, with voxels of another size.
+/// Bakes a scene with its arena, but another voxel size.
 pub(crate) fn bake(scene: &Generated, voxel_m: f64) -> DistanceField {
     let mut arena = scene.arena.clone();
     arena.occupancy.voxel_m = voxel_m;

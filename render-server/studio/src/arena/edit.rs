@@ -1,4 +1,4 @@
-//! `vizflyt arena edit`: a course is set up by dragging in the twin, and written into its arena.toml.
+//! `vizflyt arena edit`: edits a course by dragging in the twin, and writes it into the arena.toml.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -16,12 +16,14 @@ use vizflyt_splat::{Splats, ply};
 use super::file;
 use crate::page::show_page;
 
-/// Opens a page on which a course is set up in the twin: start, goal, fence, boxes to stay out of, gates, what moves.
+/// Open a page to edit a course in the twin
+///
+/// Edits start, goal, fence, no-fly boxes, gates and moving objects.
 #[derive(Args, Debug)]
 #[command(
-    after_help = "The page shows the twin as the vehicle's cameras see it. What is dragged snaps to 5 cm, to the floor and to the
-fence; every change is checked as `vizflyt arena check` does, and can be taken back. Saving changes of the file what was
-changed: comments stay. Frames of gates and boxes become splats in models/ beside it, which cameras see and vehicles hit.
+    after_help = "The page shows the twin as the vehicle's cameras see it. Dragged objects snap to 5 cm, to the floor and to the fence.
+Each change is checked as by `vizflyt arena check`, and can be undone. Saving writes only changed keys: comments stay.
+Frames of gates and boxes become splats in models/ next to the file; cameras see them, and vehicles can hit them.
 
 Examples:
   vizflyt arena new my-arena --scene room.ply --up -y --scale 0.176
@@ -29,15 +31,15 @@ Examples:
   vizflyt demo --scene my-arena"
 )]
 pub(super) struct EditArgs {
-    /// An arena.toml or its folder
+    /// arena.toml or its folder
     arena: PathBuf,
-    /// Where the page is served; port 0 takes a free one
+    /// Address of the page; port 0 selects a free one
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
     http: SocketAddr,
-    /// What draws the page's pictures
+    /// Renderer of the page's images
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
-    /// Only prints the page's address
+    /// Only print the page's address
     #[arg(long)]
     no_browser: bool,
 }
@@ -64,7 +66,7 @@ struct ArenaFile {
 
 impl CourseFile for ArenaFile {
     fn save(&self, course: &Course, models: &[(PathBuf, Arc<Splats>)]) -> Result<Vec<Line>> {
-        // Before the file that names them.
+        // The models must exist before the file refers to them.
         for (path, splats) in models {
             if let Some(folder) = path.parent() {
                 std::fs::create_dir_all(folder)

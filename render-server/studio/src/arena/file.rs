@@ -1,4 +1,4 @@
-//! An arena.toml that people have written, found and changed: what is not changed stays, comments too.
+//! Finds and edits an existing arena.toml. All text that is not changed stays, including comments.
 
 use std::path::{Path, PathBuf};
 
@@ -10,25 +10,25 @@ use toml_edit::{
 };
 use vizflyt_arena::ArenaConfig;
 
-/// Returns the file of an arena, given it or its folder.
+/// Returns the path of an arena.toml, given the file or its folder.
 ///
 /// # Errors
-/// There is none.
+/// The file does not exist.
 pub(crate) fn find(arena: &Path) -> Result<PathBuf> {
     let path = if arena.is_dir() { arena.join("arena.toml") } else { arena.to_owned() };
     ensure!(
         path.extension().is_some_and(|extension| extension == "toml") && path.is_file(),
-        "{} is no arena; make one around the scene: vizflyt arena new FOLDER --scene {}",
+        "{} is not an arena; create one for the scene: vizflyt arena new FOLDER --scene {}",
         arena.display(),
         arena.display()
     );
     Ok(path)
 }
 
-/// Changes an arena's file.
+/// Edits the file of an arena.
 ///
 /// # Errors
-/// A file that cannot be read or written, or an arena that would be none: then nothing is written.
+/// The file cannot be read or written, or the arena would be invalid. In this case, nothing is written.
 pub(crate) fn change(
     path: &Path,
     change: impl FnOnce(&mut DocumentMut) -> Result<()>,
@@ -36,11 +36,11 @@ pub(crate) fn change(
     let text =
         std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
     let mut document: DocumentMut =
-        text.parse().with_context(|| format!("{} is no TOML", path.display()))?;
+        text.parse().with_context(|| format!("{} is not valid TOML", path.display()))?;
     change(&mut document)?;
     let changed = document.to_string();
     ArenaConfig::parse(&changed).with_context(|| {
-        format!("nothing is written, for {} would not be read again", path.display())
+        format!("nothing is written, because {} would become invalid", path.display())
     })?;
     std::fs::write(path, changed).with_context(|| format!("cannot write {}", path.display()))
 }
@@ -48,10 +48,10 @@ pub(crate) fn change(
 /// Returns a table of the document.
 pub(crate) fn table<'a>(document: &'a mut DocumentMut, key: &str) -> Result<&'a mut dyn TableLike> {
     let item = document.get_mut(key).and_then(Item::as_table_like_mut);
-    item.with_context(|| format!("{key} is no table"))
+    item.with_context(|| format!("{key} is not a table"))
 }
 
-/// Sets a key; what stands about an old value stays.
+/// Sets a key. Comments and spaces around an old value stay.
 pub(crate) fn set(table: &mut dyn TableLike, key: &str, mut new: Value) {
     if let Some(old) = table.get(key).and_then(Item::as_value) {
         if is_same(old, &new) {
@@ -67,7 +67,7 @@ pub(crate) fn numbers(of: &[f64]) -> Value {
     Value::Array(of.iter().copied().collect::<Array>())
 }
 
-/// Writes a table of the document's root; makes it where there is none.
+/// Writes a table of the document's root, and creates it if it is missing.
 pub(crate) fn put(document: &mut DocumentMut, key: &str, new: &impl Serialize) -> Result<()> {
     let new = written(new)?;
     if document.contains_key(key) {
@@ -78,8 +78,8 @@ pub(crate) fn put(document: &mut DocumentMut, key: &str, new: &impl Serialize) -
     Ok(())
 }
 
-/// Writes a list of tables, each of a name: those of a name that was there keep their comments, and those that say what they
-/// said every letter.
+/// Writes a list of named tables. Tables with an existing name keep their comments. Tables with unchanged values keep
+/// their exact text.
 pub(crate) fn put_list<T>(document: &mut DocumentMut, key: &str, new: &[T]) -> Result<()>
 where
     T: Serialize + DeserializeOwned + PartialEq,
@@ -92,7 +92,7 @@ where
         None => Vec::new(),
         Some(Item::ArrayOfTables(old)) => old.iter().cloned().collect(),
         Some(item) => {
-            let array = item.as_array().with_context(|| format!("{key} is no list of tables"))?;
+            let array = item.as_array().with_context(|| format!("{key} is not a list of tables"))?;
             let inline = array.iter().filter_map(Value::as_inline_table);
             inline.cloned().map(InlineTable::into_table).collect()
         }
@@ -112,7 +112,7 @@ where
         tables.push(table);
     }
     if let Some(array) = document.get_mut(key).and_then(Item::as_array_mut) {
-        // One line each, as people write them.
+        // One line for each table.
         array.clear();
         for table in tables {
             let mut inline = Value::InlineTable(table.into_inline_table());
@@ -131,7 +131,7 @@ fn name(table: &Table) -> Option<&str> {
     table.get("name")?.as_str()
 }
 
-/// Returns what serde writes, tables in it as values.
+/// Serializes a value as a table, with inner tables as inline values.
 fn written(of: &impl Serialize) -> Result<Table> {
     let document: DocumentMut = toml::to_string(of)?.parse()?;
     let mut table = Table::new();
@@ -142,7 +142,7 @@ fn written(of: &impl Serialize) -> Result<Table> {
     Ok(table)
 }
 
-/// Makes an old table say what a new one does.
+/// Gives an old table the values of a new one, and keeps its comments.
 fn merge(old: &mut dyn TableLike, new: &Table) {
     let gone: Vec<String> =
         old.iter().map(|(key, _)| key.to_owned()).filter(|key| !new.contains_key(key)).collect();
@@ -160,7 +160,7 @@ fn merge(old: &mut dyn TableLike, new: &Table) {
     }
 }
 
-/// Whether two values mean the same: 1 is 1.0.
+/// Whether two values are equal; 1 equals 1.0.
 fn is_same(a: &Value, b: &Value) -> bool {
     let number = |value: &Value| match value {
         Value::Integer(n) => Some(*n.value() as f64),
@@ -228,7 +228,7 @@ max_speed_mps = 2.0
     }
 
     #[test]
-    fn what_is_not_changed_keeps_every_letter() {
+    fn unchanged_tables_keep_their_exact_text() {
         let second = StageConfig {
             center_m: DVec3::new(6.0, 0.0, 1.0),
             width_m: 1.0,
@@ -238,7 +238,7 @@ max_speed_mps = 2.0
     }
 
     #[test]
-    fn gates_are_moved_added_and_removed() {
+    fn moves_adds_and_removes_gates() {
         let changed = with_stages(TEXT, &[stage("first", 3.5), stage("third", 8.0)]);
         for kept in [
             "# A course",
@@ -259,7 +259,7 @@ max_speed_mps = 2.0
     }
 
     #[test]
-    fn lists_of_one_line_stay_such() {
+    fn inline_lists_stay_inline() {
         let text = "a = 1\nstages = [\n    { name = \"one\", center_m = [1, 0, 1], normal = [1, 0, 0], width_m = 1, height_m = 1 },\n]\n[b]\nc = 2\n";
         let changed = with_stages(text, &[stage("one", 2.0), stage("two", 4.0)]);
         let read: DocumentMut = changed.parse().unwrap();
@@ -269,7 +269,7 @@ max_speed_mps = 2.0
     }
 
     #[test]
-    fn a_table_is_changed_where_it_stands() {
+    fn changes_a_table_in_place() {
         let mut document: DocumentMut = TEXT.parse().unwrap();
         let goal = Goal { position_m: DVec3::new(8.0, 0.0, 1.0), radius_m: 0.5 };
         put(&mut document, "goal", &goal).unwrap();

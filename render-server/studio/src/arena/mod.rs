@@ -1,4 +1,4 @@
-//! `vizflyt arena`: makes rooms for captured scenes, sets up courses in them, and looks at both before anyone flies.
+//! `vizflyt arena`: creates arenas for captured scenes, edits their courses, and checks them before a flight.
 
 mod edit;
 pub(crate) mod file;
@@ -19,7 +19,7 @@ use vizflyt_server::poses::settings;
 use vizflyt_server::render::sensors::SensorSet;
 use vizflyt_server::scene::{self, BareArgs};
 
-/// Makes rooms for captured scenes, sets up courses in them, and looks at both before anyone flies.
+/// Make and check arenas for captured scenes, and edit their courses
 #[derive(Args, Debug)]
 pub struct ArenaArgs {
     #[command(subcommand)]
@@ -33,24 +33,26 @@ enum ArenaCommand {
     Edit(edit::EditArgs),
 }
 
-/// Reports whether a course can be flown: the scene lies in it as it is meant, the start is free, gates fit the vehicle and the room, a way leads
-/// through all of them, and nothing that moves bars it for good.
+/// Check that a course can be flown
+///
+/// Checks placement of the scene, free space at the start, size of the gates, a path through all
+/// gates, and that moving objects do not block it permanently.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt arena check my-room/arena.toml        errors with the line of the file; status 0 if it can be flown
   vizflyt arena check --project p5 --seeds 20   the course's project, on seeds 0 to 19")]
 struct CheckArgs {
-    /// An arena.toml or its folder
+    /// arena.toml or its folder
     #[arg(required_unless_present = "project", conflicts_with = "project")]
     arena: Option<PathBuf>,
     #[arg(long, value_name = "NAME", help = format!(
-        "A project of the course: {}; or a file of your own, FILE.toml", projects::NAMES.join(", ")
+        "A project of the course: {}; or a project file, FILE.toml", projects::NAMES.join(", ")
     ))]
     project: Option<String>,
-    /// This seed of the project alone
+    /// Check only this seed of the project
     #[arg(long, requires = "project", conflicts_with = "seeds")]
     seed: Option<u64>,
-    /// The project's first seeds, from 0
+    /// Number of seeds of the project, from 0
     #[arg(long, value_name = "N", default_value_t = 10)]
     seeds: u64,
 }
@@ -86,7 +88,7 @@ fn check_all(args: &CheckArgs) -> Result<ExitCode> {
 }
 
 fn check_seed(project: &CourseProject, seed: u64) -> bool {
-    // Levels differ in sensors, variants in light: neither changes where one can fly.
+    // Levels only differ in sensors, variants only in light and weather: neither changes the free space.
     let generated = project.generate(seed, Level::default(), Variant::default());
     let still = Arc::new(scene::bake(&generated.splats, &generated.arena, None));
     let obstacles = scene::obstacles(&generated.arena, &generated.objects, still, seed);
@@ -106,7 +108,7 @@ fn check_file(path: &Path) -> Result<bool> {
     let file = if path.is_dir() { path.join("arena.toml") } else { path.to_owned() };
     let is_toml = file.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("toml"));
     if !is_toml {
-        bail!("{} is no arena.toml: a bare scene has no course to check", file.display());
+        bail!("{} is not an arena.toml: a bare scene has no course to check", file.display());
     }
     let text = std::fs::read_to_string(&file)
         .with_context(|| format!("cannot read {}", file.display()))?;
@@ -129,7 +131,7 @@ fn check_file(path: &Path) -> Result<bool> {
 
 fn print_summary(what: &str, stages: usize, checked: &Checked) {
     if !checked.findings.is_empty() {
-        print_fmt!("{what}: cannot be flown, {} found", checked.findings.len());
+        print_fmt!("{what}: cannot be flown, problems: {}", checked.findings.len());
         return;
     }
     let room = if checked.least_room_m.is_finite() {
@@ -137,5 +139,5 @@ fn print_summary(what: &str, stages: usize, checked: &Checked) {
     } else {
         String::new()
     };
-    print_fmt!("{what}: can be flown; {stages} stages{room}; a way of {:.1} m", checked.way_m);
+    print_fmt!("{what}: can be flown; {stages} stages{room}; a path of {:.1} m", checked.way_m);
 }

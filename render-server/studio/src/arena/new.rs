@@ -1,4 +1,4 @@
-//! `vizflyt arena new`: an `arena.toml` around a captured scene, to be edited: fence, start, gates.
+//! `vizflyt arena new`: writes an `arena.toml` for a captured scene, with a fence and a start to be edited.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -9,10 +9,12 @@ use vizflyt_process::print_fmt;
 use vizflyt_scenes::Variant;
 use vizflyt_server::scene::{self, BareArgs, is_in_an_arena};
 
-/// Writes an arena.toml around a scene file: how it lies, a fence around its core, a start with a view.
+/// Write an arena.toml for a scene file
+///
+/// Sets the placement of the scene, a fence around its core, and a start with a view.
 #[derive(Args, Debug)]
 #[command(
-    after_help = "The file stays where it is. Edit what was written, then look at it and check it:
+    after_help = "The scene file stays in its place. Edit the arena.toml, then view and check it:
   vizflyt scene view my-arena
   vizflyt arena check my-arena
   vizflyt demo --scene my-arena
@@ -21,18 +23,18 @@ Example:
   vizflyt arena new my-arena --scene room.ply --up -y --scale 0.176"
 )]
 pub(super) struct NewArgs {
-    /// Folder to write arena.toml to; made if absent
+    /// Folder for arena.toml; created if missing
     folder: PathBuf,
-    /// The scene: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat
+    /// Scene file: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat
     #[arg(long, value_name = "FILE")]
     scene: PathBuf,
     #[command(flatten)]
     bare: BareArgs,
     #[arg(long, value_name = "NAME", default_value_t, help = format!(
-        "The light and the weather it is flown in: {}", Variant::names()
+        "Light and weather: {}", Variant::names()
     ))]
     environment: Variant,
-    /// Replaces an arena.toml that is already there
+    /// Replace an existing arena.toml
     #[arg(long)]
     force: bool,
 }
@@ -75,19 +77,19 @@ pub(super) fn run(args: &NewArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns the way from a folder to a file, both of which exist.
+/// Returns the relative path from an existing folder to an existing file.
 fn from_folder(folder: &Path, file: &Path) -> Result<String> {
     let real = |path: &Path| {
         path.canonicalize().with_context(|| format!("cannot resolve {}", path.display()))
     };
     let way = way(&real(folder)?, &real(file)?);
     let text = way.to_str().with_context(|| {
-        format!("{} is no text, which arena.toml is; rename the file", way.display())
+        format!("the path {} is not valid UTF-8, which arena.toml requires; rename the file", way.display())
     })?;
     Ok(text.to_owned())
 }
 
-/// Returns the way from one absolute path to another.
+/// Returns the relative path from one absolute path to another.
 fn way(folder: &Path, file: &Path) -> PathBuf {
     let shared = folder.components().zip(file.components()).take_while(|(a, b)| a == b).count();
     let up = folder.components().skip(shared).map(|_| Component::ParentDir);
@@ -95,8 +97,8 @@ fn way(folder: &Path, file: &Path) -> PathBuf {
 }
 
 const HEAD: &str = "\
-# Made by `vizflyt arena new`. [scene] says how the file lies in the world; the fence goes around its core.
-# Correct what was guessed (a door is 2 m high), then set up a course: `vizflyt arena edit`, or by hand: docs/guides/arena-reference.md.
+# Written by `vizflyt arena new`. [scene] places the file in the world; the fence surrounds its core.
+# Correct the guessed values (a door is 2 m high), then edit the course: `vizflyt arena edit`, or by hand: docs/guides/arena-reference.md.
 ";
 
 #[cfg(test)]
@@ -104,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_way_to_a_file_is_relative() {
+    fn computes_relative_paths() {
         let check = |folder: &str, file: &str, expected: &str| {
             assert_eq!(way(Path::new(folder), Path::new(file)), Path::new(expected));
         };

@@ -1,22 +1,22 @@
-//! The classes of pixels and things: a fixed list, and behind it those that a file of parts adds.
+//! Classes of pixels and things: a fixed list, followed by the classes of a parts file.
 
 use anyhow::{Result, ensure};
 use vizflyt_scenes::parts::PartClass;
 
-/// All classes of a data set; a class's number is its place, 0 where nothing was hit, or too little.
+/// All classes of a data set. The number of a class is its index; 0 means that (almost) nothing was hit.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Classes {
     names: Vec<String>,
 }
 
-/// What nobody has named.
+/// Splats without a named part.
 pub(super) const SCENE: u8 = 1;
 pub(super) const GATE: u8 = 2;
 pub(super) const VEHICLE: u8 = 3;
 pub(super) const MOVING: u8 = 4;
 pub(super) const DISTRACTOR: u8 = 5;
 
-/// In the order of their numbers.
+/// Fixed classes in order of their numbers.
 const FIXED: [&str; 15] = [
     "nothing",
     "scene",
@@ -34,14 +34,14 @@ const FIXED: [&str; 15] = [
     "backdrop",
     "part",
 ];
-/// Of these nobody counts the instances: they are surroundings.
+/// Classes of surroundings, which have no instances.
 const SURROUNDINGS: [&str; 7] = ["nothing", "scene", "room", "ground", "tree", "plant", "backdrop"];
 
 impl Classes {
-    /// Returns the fixed ones and these.
+    /// Returns the fixed classes and the given ones.
     ///
     /// # Errors
-    /// More than 255.
+    /// There are more than 256 classes.
     pub(super) fn with<'a>(added: impl Iterator<Item = &'a str>) -> Result<Self> {
         let mut names: Vec<String> = FIXED.map(str::to_owned).into();
         for name in added {
@@ -49,7 +49,7 @@ impl Classes {
                 names.push(name.to_owned());
             }
         }
-        ensure!(names.len() <= 256, "{} classes, where 8 bits a pixel hold 256", names.len());
+        ensure!(names.len() <= 256, "{} classes, but the 8 bits of a pixel allow 256", names.len());
         Ok(Self { names })
     }
 
@@ -71,12 +71,12 @@ impl Classes {
         self.names.get(usize::from(number)).map_or("nothing", String::as_str)
     }
 
-    /// Whether it has instances: things, not surroundings.
+    /// Whether a class has instances, which surroundings do not.
     pub(super) fn is_thing(&self, number: u8) -> bool {
         !SURROUNDINGS.contains(&self.name(number))
     }
 
-    /// Returns the names of things.
+    /// Returns the names of all classes of things.
     pub(super) fn things(&self) -> impl Iterator<Item = &str> {
         self.names.iter().map(String::as_str).filter(|name| !SURROUNDINGS.contains(name))
     }
@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_are_places_in_the_list() {
+    fn numbers_are_indices_in_the_list() {
         let classes = Classes::with(["table", "gate"].into_iter()).unwrap();
         for (number, name) in [(GATE, "gate"), (VEHICLE, "vehicle"), (MOVING, "moving")] {
             assert_eq!((classes.number(name), classes.name(number)), (Some(number), name));

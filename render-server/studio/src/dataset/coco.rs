@@ -1,7 +1,7 @@
 //! COCO's annotations (Lin et al. 2014; cocodataset.org, "Data format"): `annotations/instances_SPLIT.json`.
 //!
-//! One category for each class of things; masks as compressed RLE, which holes need; corners of a gate as its keypoints.
-//! Beside COCO's keys an image has `world_from_cam` and `camera`, a gate's annotation `cam_from_gate`.
+//! Each class of things is a category. Masks are compressed RLE, which can store holes. Keypoints of a gate are its
+//! corners. Additional keys: `world_from_cam` and `camera` of an image, `cam_from_gate` of a gate's annotation.
 
 use std::fs;
 use std::io::{BufWriter, Write};
@@ -62,7 +62,7 @@ fn categories(things: &[String]) -> Value {
 
 fn image(store: &Store, record: &ImageRecord) -> Value {
     let file = store.layer(Layer::Rgb, &record.name());
-    // Relative to `images/SPLIT`.
+    // File names are relative to `images/SPLIT`.
     let file = file.rsplit('/').next().unwrap_or(&file);
     json!({
         "id": record.index + 1,

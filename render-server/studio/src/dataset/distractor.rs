@@ -1,4 +1,4 @@
-//! Distractors: boxes, cylinders and spheres of plain splats, that belong to nothing.
+//! Distractors: boxes, cylinders and spheres of plain splats without any meaning.
 
 use std::f32::consts::TAU;
 
@@ -9,7 +9,7 @@ use vizflyt_twin::random::Random;
 
 use super::texture::{self, SH_CONSTANT};
 
-/// Returns a solid about the origin whose greatest half side is `reach_m`. [m, object]
+/// Returns a solid around the origin with a maximum half side of `reach_m`. [m, object]
 pub(super) fn solid(reach_m: f32, random: &mut Random) -> Splats {
     let colour = texture::colour(random);
     match random.below(3) {
@@ -26,11 +26,11 @@ pub(super) fn solid(reach_m: f32, random: &mut Random) -> Splats {
     }
 }
 
-/// A point of a surface, its outward direction, and the area that a patch there covers.
+/// Point on a surface, outward normal, and area of its patch.
 type Point = (Vec3, Vec3, f32);
 
 fn sphere(radius_m: f32) -> Vec<Point> {
-    // Fibonacci's lattice: even to within a few percent.
+    // Fibonacci lattice: even within a few percent.
     let area = 4.0 * std::f32::consts::PI * radius_m * radius_m;
     let count = ((area / PATCH_M2).ceil() as usize).clamp(60, 4000);
     let golden = TAU * 0.381_966;
@@ -90,9 +90,9 @@ fn patches(points: Vec<Point>, colour: Vec3) -> Splats {
     splats
 }
 
-/// What a patch covers. [m^2]
+/// Area of a patch. [m^2]
 const PATCH_M2: f32 = 0.02 * 0.02;
-/// Neighbours overlap enough to be opaque.
+/// Standard deviation relative to the side of a patch, so that neighbours overlap to an opaque surface.
 const OVERLAP: f32 = 0.6;
 
 #[cfg(test)]
@@ -104,7 +104,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn solids_are_within_their_reach_and_opaque() {
+    fn solids_keep_their_size_and_are_opaque() {
         for n in 0..30 {
             let splats = solid(0.2, &mut Random::stream(7, n));
             let reach_m = splats.means_m.iter().map(|p| p.length()).fold(0.0, f32::max);

@@ -1,6 +1,6 @@
-//! EuRoC's layout of each scene: `SCENE/mav0/cam0`, `depth0` and the other layers, and the camera's true poses.
+//! EuRoC layout of each scene: `SCENE/mav0/cam0`, `depth0` and the other layers, and the true poses of the camera.
 //!
-//! The body is the camera's bearer with the camera in its origin: x ahead, y left, z up.
+//! The body frame has the camera at its origin: x forward, y left, z up.
 
 use std::collections::BTreeMap;
 
@@ -47,13 +47,13 @@ pub(super) fn write(store: &Store, labelled: &Labelled<'_>, layers: &[Layer]) ->
         });
         let root = store.root().join(scene).join("mav0/state_groundtruth_estimate0");
         write_whole(&root.join("data.csv"), truth_csv(rows).as_bytes())?;
-        let yaml = truth_yaml("the true pose of the camera's bearer in the world");
+        let yaml = truth_yaml("true pose of the body, with the camera at its origin, in the world");
         write_whole(&root.join("sensor.yaml"), yaml.as_bytes())?;
     }
     Ok(())
 }
 
-/// Returns the velocity towards where the camera is next; 0 where there is no next. [m/s, world]
+/// Returns the mean velocity to the next camera pose; 0 if there is none. [m/s, world]
 fn velocity_mps(record: &ImageRecord) -> DVec3 {
     record.next.map_or(DVec3::ZERO, |next| {
         let way_m = DVec3::from(next.world_from_cam.p_m) - DVec3::from(record.world_from_cam.p_m);

@@ -1,7 +1,7 @@
-//! Where a camera may be: the free space of a scene.
+//! Free space of a scene, in which a camera may be.
 //!
-//! Of a generated scene by its true solids; of any other by the distance field that the referee bakes of its splats, where what
-//! a capture has not seen is solid if its arena says so.
+//! For a generated scene, its true solids define it. For any other scene, the referee's distance field defines it, in
+//! which unseen space is solid if the arena says so.
 
 use glam::DVec3;
 use vizflyt_arena::Obstacles;
@@ -10,26 +10,26 @@ use vizflyt_arena::objects::MovingObjects;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_twin::random::Random;
 
-/// The free space within a fence.
+/// Free space within a fence.
 #[derive(Debug)]
 pub(super) struct FreeSpace {
     pub(super) fence: Geofence,
-    /// What must not be entered though nothing is there. [m, world]
+    /// No-fly volumes. [m, world]
     pub(super) no_fly: Vec<Volume>,
     pub(super) solid: Solid,
 }
 
-/// What is not free.
+/// Solid space.
 #[derive(Debug)]
 pub(super) enum Solid {
-    /// True solids; of objects in their own frames.
+    /// True solids; those of objects are in the object's frame.
     True { still: Vec<Volume>, moving: Vec<Vec<Volume>>, objects: MovingObjects },
-    /// As the referee has them.
+    /// Obstacles of the referee.
     Baked(Obstacles),
 }
 
 impl FreeSpace {
-    /// Whether a ball is free at an instant; false for what is no number. [m, world; ns]
+    /// Whether a sphere is free at an instant; false for a NaN position. [m, world; ns]
     pub(super) fn is_free(&self, at_ns: i64, p_m: DVec3, radius_m: f64) -> bool {
         let Geofence { min_m, max_m } = self.fence;
         let room_m = (p_m - min_m).min(max_m - p_m).min_element();
@@ -57,7 +57,7 @@ impl FreeSpace {
         forbidden_m.min(solid_m)
     }
 
-    /// Draws a point within the fence, free or not. [m, world]
+    /// Draws a point within the fence, which need not be free. [m, world]
     pub(super) fn draw(&self, random: &mut Random) -> DVec3 {
         let Geofence { min_m, max_m } = self.fence;
         let share = DVec3::from_array([(); 3].map(|()| f64::from(random.unit())));
@@ -70,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn solids_fence_and_forbidden_places_are_not_free() {
+    fn solids_fence_and_no_fly_volumes_are_not_free() {
         let space = FreeSpace {
             fence: Geofence { min_m: DVec3::ZERO, max_m: DVec3::splat(10.0) },
             no_fly: vec![Volume::aabb(DVec3::splat(8.0), DVec3::splat(9.0))],

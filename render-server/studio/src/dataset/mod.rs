@@ -1,15 +1,15 @@
-//! `vizflyt dataset`: labelled images of a scene, to train and to measure with.
+//! `vizflyt dataset`: renders labelled images of a scene, for training and evaluation.
 //!
 //! ```text
-//! options -> asked (dataset.json): what the bytes depend on, and nothing else
-//! scene, one after the other:
+//! options -> asked (dataset.json): exactly the settings that determine the files
+//! for each scene:
 //!   world     splats cut into things, gates, free space
-//!   shot      pose, light, textures of image N, by the seeds and N alone
-//!   render    colour, depth, ids -> layers (labels); a thread each, one image at a time
-//!   store     files of the layers, then the image's record: it is whole
-//! all images there: coco | yolo | euroc, of the records
+//!   shot      pose, light, textures of image N: a function of the seeds and N
+//!   render    colour, depth, ids -> layers (labels); one image at a time on each thread
+//!   store     files of the layers, then the record, which marks the image as complete
+//! after all images: coco | yolo | euroc, from the records
 //! ```
-//! So an image is the same whoever renders it: in parts (`--shard`), again after an interruption, on any number of threads.
+//! Therefore, shards (`--shard`), interruptions and the number of threads do not change an image.
 
 mod classes;
 mod coco;
@@ -52,17 +52,20 @@ use crate::evaluate::trajectory::{self, Stamped};
 use crate::scene::camera::ImageSize;
 use crate::shard::Shard;
 
-/// Renders labelled images of a scene: colour, depth, normals, masks, optical flow, boxes, corners of gates.
+/// Render labelled images of a scene as a data set
+///
+/// Layers: colour, depth, normals, masks, optical flow. Annotations: boxes, masks, corners of
+/// gates.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  vizflyt dataset --project p3 --seeds 10 --images 2000 -o windows            COCO, a tenth held out by its scenes
+  vizflyt dataset --project p3 --seeds 10 --images 2000 -o windows            COCO, a tenth of the scenes held out
   vizflyt dataset --project p3 --images 500 --format yolo-seg -o windows --things gate
   vizflyt dataset --project p5 --randomize randomize.toml --sheet sheet.jpg -o race
   vizflyt dataset --scene my-room --parts parts.toml --images 300 -o room     parts of a captured scene, named by boxes
   vizflyt dataset --project forest --path flight.tum --format euroc -o along  along a path
-  vizflyt dataset --project p3 --images 9000 --shard 1/3 -o part              a third; run again, it goes on
+  vizflyt dataset --project p3 --images 9000 --shard 1/3 -o part              a third; run again to resume
 
-What each layer and file holds is in docs/guides/datasets.md.")]
+docs/guides/datasets.md describes all layers and files.")]
 #[command(group = ArgGroup::new("world").args(["project", "scene"]).required(true))]
 pub struct DatasetArgs {
     #[arg(long, value_name = "NAME", help = format!(
@@ -74,25 +77,25 @@ pub struct DatasetArgs {
     scene: Option<PathBuf>,
     #[command(flatten)]
     bare: BareArgs,
-    /// Seed of the first course, and of everything that is drawn
+    /// Seed of the first course, and of all random values
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
-    /// How many courses of --project, one seed after the other
+    /// Number of courses of --project, with consecutive seeds
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     seeds: u32,
-    /// Folder to write to; what of the same data set is there already is kept
+    /// Output folder; an interrupted data set is resumed
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// How many images, over all courses [default: 100, or all of --path]
+    /// Number of images over all courses [default: 100, or all of --path]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
     images: Option<u64>,
-    /// Size of the images
+    /// Image size
     #[arg(long, value_name = "WxH", default_value = "320x240")]
     size: ImageSize,
     /// Horizontal field of view [deg]
     #[arg(long, value_name = "DEG", default_value_t = 90.0)]
     fov: f64,
-    /// What is written of each image
+    /// Layers to write for each image
     #[arg(
         long,
         value_enum,
@@ -100,55 +103,61 @@ pub struct DatasetArgs {
         default_value = "rgb,depth,normals,instances,classes,flow"
     )]
     layers: Vec<Layer>,
-    /// Whose layout
+    /// Layout of the data set
     #[arg(long, value_enum, default_value_t = Format::Coco)]
     format: Format,
-    /// Colour as JPEG of this quality, not as PNG
+    /// JPEG quality of the colour images [default: PNG]
     #[arg(long, value_name = "QUALITY", value_parser = clap::value_parser!(u8).range(1..=100))]
     jpeg: Option<u8>,
-    /// Classes that are annotated [default: all classes of things]
+    /// Annotated classes [default: all classes of things]
     #[arg(long, value_name = "CLASS", value_delimiter = ',')]
     things: Vec<String>,
-    /// Things of fewer pixels are not annotated
+    /// Minimum size of annotated things [px]
     #[arg(long, value_name = "PX", default_value_t = 12)]
     min_area: u32,
-    /// Share of the images that is held out, by whole courses where there are several
+    /// Held-out share of the images; complete courses if there are several
     #[arg(long, value_name = "SHARE", default_value_t = 0.1)]
     val: f64,
-    /// Poses along a path: TUM's text, EuRoC's CSV or a flight's log; else they are drawn in the free space
+    /// Path with poses: TUM text, EuRoC CSV or a flight's log
+    ///
+    /// Without it, random poses in the free space are used.
     #[arg(long, value_name = "FILE")]
     path: Option<String>,
-    /// What the poses of --path are of
+    /// Frame of the poses of --path
     #[arg(long, value_enum, default_value_t, requires = "path")]
     path_of: PathOf,
-    /// Drawn poses keep this from everything solid [m]
+    /// Minimum distance of random poses from solid space [m]
     #[arg(long, value_name = "M", default_value_t = 0.25, conflicts_with = "path")]
     clearance: f64,
-    /// Drawn poses pitch and roll up to this [deg]
+    /// Maximum pitch and roll of random poses [deg]
     #[arg(long, value_name = "DEG", default_value_t = 15.0, conflicts_with = "path")]
     tilt: f64,
-    /// Probability that a drawn pose looks towards a gate
+    /// Probability that a random pose looks towards a gate
     #[arg(long, value_name = "P", default_value_t = 0.7, conflicts_with = "path")]
     look_at_gate: f64,
-    /// How far from that gate [m]
+    /// Range of distances from that gate [m]
     #[arg(long, value_name = "LEAST..MOST", default_value = "0.8..5", value_parser = bounds, conflicts_with = "path")]
     gate_distance: [f64; 2],
-    /// Optical flow of drawn poses is to where the camera is this much later [s]
+    /// Time between the two images of optical flow, for random poses [s]
     #[arg(long, value_name = "S", default_value_t = 0.04, conflicts_with = "path")]
     flow_dt: f64,
-    /// What changes from image to image: light, fog, textures of gates, distractors, vehicles, the camera
+    /// Randomization from image to image
+    ///
+    /// Light, fog, textures of gates, distractors, vehicles, the camera.
     #[arg(long, value_name = "FILE.toml")]
     randomize: Option<PathBuf>,
-    /// Parts of the scene, named by boxes
+    /// Parts of the scene, defined by boxes
     #[arg(long, value_name = "FILE.toml")]
     parts: Option<PathBuf>,
-    /// Renders only this part, as 2/4; whoever ends last, or a run without it, writes the annotations
+    /// Render only shard I of N, as 2/4
+    ///
+    /// The last shard to finish, or a run without this option, writes the annotations.
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
-    /// Threads [default: one a core]
+    /// Number of threads [default: one per core]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
-    /// Writes a few images with all of their layers to a PNG or JPEG, to look at
+    /// PNG or JPEG with a few images and all of their layers
     #[arg(long, value_name = "FILE")]
     sheet: Option<PathBuf>,
 }
@@ -169,7 +178,7 @@ pub fn run(args: &DatasetArgs) -> Result<ExitCode> {
     }
     let missing = (0..plan.images).filter(|&index| !plan.is_there(&store, index)).count();
     if missing > 0 {
-        print_fmt!("missing     {missing} of {} images; run the other parts", plan.images);
+        print_fmt!("missing     {missing} of {} images; run the other shards", plan.images);
     } else {
         write_annotations(&plan, &store, args.format)?;
         print_fmt!("complete    {} images in {}", plan.images, args.output.display());
@@ -192,10 +201,10 @@ fn write_annotations(plan: &Plan, store: &Store, format: Format) -> Result<()> {
     }
 }
 
-/// What writers of annotations read.
+/// Input of the writers of annotations.
 struct Labelled<'a> {
     plan: &'a Plan,
-    /// The classes that are annotated, in the order of their numbers.
+    /// Annotated classes, in order of their numbers.
     things: Vec<String>,
 }
 
@@ -206,7 +215,7 @@ impl Labelled<'_> {
         of_split.map(move |index| self.plan.with_name(index, |name| store.read(name)))
     }
 
-    /// Returns what of an image is annotated, with the number of its class.
+    /// Returns the annotated things of an image, with the indices of their classes.
     fn annotated<'r>(
         &self,
         record: &'r ImageRecord,
@@ -219,7 +228,7 @@ impl Labelled<'_> {
     }
 }
 
-/// Checks the options, and says what the bytes depend on.
+/// Checks the options and returns the plan.
 fn plan(args: &DatasetArgs) -> Result<Plan> {
     let randomize = args.randomize.as_deref().map(Randomize::read).transpose()?.unwrap_or_default();
     let parts = args.parts.as_deref().map(PartsFile::read).transpose()?.unwrap_or_default();
@@ -233,7 +242,7 @@ fn plan(args: &DatasetArgs) -> Result<Plan> {
         sides.contains(&width_px) && sides.contains(&height_px),
         "--size {width_px}x{height_px}: give sides of 16 to 4096 px"
     );
-    ensure!(args.layers.contains(&Layer::Rgb), "--layers lacks rgb, which every layout has");
+    ensure!(args.layers.contains(&Layer::Rgb), "--layers must include rgb");
     let poses = poses(args)?;
     let images = match (&poses, args.images) {
         (Poses::Random(_), images) => images.unwrap_or(100),
@@ -260,7 +269,7 @@ fn plan(args: &DatasetArgs) -> Result<Plan> {
     for name in &things {
         ensure!(
             classes.things().any(|known| known == name),
-            "--things {name}: there is no such class of things; there are {}",
+            "--things {name}: unknown class of things; there are {}",
             classes.things().collect::<Vec<_>>().join(", ")
         );
     }
@@ -297,7 +306,7 @@ fn source(args: &DatasetArgs) -> Result<SceneSource> {
         return Ok(SceneSource::Project(Box::new(CourseProject::named(name)?)));
     }
     let path = args.scene.clone().context("give --project or --scene")?;
-    ensure!(args.seeds == 1, "--seeds is of --project; a scene is one");
+    ensure!(args.seeds == 1, "--seeds is for --project; --scene has only one scene");
     Ok(SceneSource::Scene(path, args.bare))
 }
 
@@ -326,7 +335,7 @@ fn poses(args: &DatasetArgs) -> Result<Poses> {
     }))
 }
 
-/// Returns what the bytes of the data set depend on.
+/// Returns all settings that determine the files of the data set, for `dataset.json`.
 fn asked(
     args: &DatasetArgs,
     source: &SceneSource,
@@ -386,11 +395,11 @@ fn asked(
     }))
 }
 
-/// `0.8..5`
+/// Parses `0.8..5`.
 fn bounds(text: &str) -> Result<[f64; 2], String> {
     let ends = text.split_once("..").and_then(|(a, b)| Some([a.parse().ok()?, b.parse().ok()?]));
     match ends {
         Some([least, most]) if 0.1 <= least && least <= most && most <= 100.0 => Ok([least, most]),
-        _ => Err(format!("'{text}' is no range of 0.1 to 100 m; write it as 0.8..5")),
+        _ => Err(format!("'{text}' is not a range within 0.1 to 100 m; write it as 0.8..5")),
     }
 }

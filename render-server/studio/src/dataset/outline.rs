@@ -1,9 +1,9 @@
-//! The outline of a mask as one polygon, as YOLO's segments want it: around the pixels, holes joined by a seam.
+//! Outline of a mask as one polygon, as YOLO's segments require: around the pixels, with holes joined by seams.
 //!
-//! Corners of pixels are walked with the mask on the right. A loop that turns the other way is a hole; each further loop is
-//! joined to the polygon so far by the shortest seam, there and back, so that the even-odd rule fills the mask.
+//! The boundary is followed with the mask on the right. A loop in the other direction is a hole. Each further loop is
+//! joined to the polygon by the shortest seam, in both directions, so that the even-odd rule fills the mask.
 
-/// Returns the polygon of a mask in corners of pixels; empty if no pixel is set. Row-major pixels in. [px]
+/// Returns the polygon of a row-major mask, in corners of pixels; empty if no pixel is set. [px]
 pub(super) fn outline(pixels: &[bool], size: [usize; 2]) -> Vec<[u32; 2]> {
     let mut loops = loops(pixels, size).into_iter();
     let Some(mut polygon) = loops.next() else { return Vec::new() };
@@ -13,17 +13,17 @@ pub(super) fn outline(pixels: &[bool], size: [usize; 2]) -> Vec<[u32; 2]> {
     polygon
 }
 
-/// Where one goes from a corner: to the right, down, to the left, up.
+/// Directions from a corner: right, down, left, up.
 const STEPS: [[i32; 2]; 4] = [[1, 0], [0, 1], [-1, 0], [0, -1]];
 
-/// Returns the loops about the mask's pixels, the largest first.
+/// Returns the boundary loops of the mask, the largest first.
 fn loops(pixels: &[bool], [width, height]: [usize; 2]) -> Vec<Vec<[u32; 2]>> {
     let is_set = |x: i32, y: i32| {
         (0..width as i32).contains(&x)
             && (0..height as i32).contains(&y)
             && pixels[y as usize * width + x as usize]
     };
-    // An edge leaves a corner in a direction where the pixel to its right is set and that to its left is not.
+    // A boundary edge has a set pixel on its right and none on its left.
     let leaves = |x: i32, y: i32, direction: usize| {
         let [right, left] = match direction {
             0 => [[0, 0], [0, -1]],
@@ -51,7 +51,7 @@ fn loops(pixels: &[bool], [width, height]: [usize; 2]) -> Vec<Vec<[u32; 2]>> {
                 }
                 before = direction;
                 corner = [corner[0] + STEPS[direction][0], corner[1] + STEPS[direction][1]];
-                // To the right first: pixels that touch at a corner alone are of two loops.
+                // Right turns first, so that pixels that only touch at a corner are in separate loops.
                 let turns = [1, 0, 3].map(|turn| (direction + turn) % 4);
                 direction = turns
                     .into_iter()
@@ -61,7 +61,7 @@ fn loops(pixels: &[bool], [width, height]: [usize; 2]) -> Vec<Vec<[u32; 2]>> {
             found.push(corners);
         }
     }
-    // By their boxes: a hole is within what it is of.
+    // Sorted by their boxes, so that a hole comes after the loop around it.
     let reach = |corners: &[[u32; 2]]| {
         let side = |axis: usize| {
             let sides = corners.iter().map(|corner| corner[axis]);
@@ -73,7 +73,7 @@ fn loops(pixels: &[bool], [width, height]: [usize; 2]) -> Vec<Vec<[u32; 2]>> {
     found
 }
 
-/// Joins a loop to a polygon by the shortest seam between two of their corners.
+/// Joins a loop to a polygon by the shortest seam between two corners.
 fn join(polygon: &mut Vec<[u32; 2]>, hole: &[[u32; 2]]) {
     let distance2 = |a: [u32; 2], b: [u32; 2]| {
         let side = |axis: usize| u64::from(a[axis].abs_diff(b[axis])).pow(2);
@@ -93,7 +93,7 @@ mod tests {
 
     use super::*;
 
-    /// Whether a pixel's middle is inside, by the even-odd rule.
+    /// Whether the centre of a pixel is inside, by the even-odd rule.
     fn is_inside(polygon: &[[u32; 2]], x: usize, y: usize) -> bool {
         let (px, py) = (x as f64 + 0.5, y as f64 + 0.5);
         let mut inside = false;
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_is_one_polygon_with_its_hole() {
+    fn joins_the_hole_of_a_frame_to_one_polygon() {
         let set = |k: usize| {
             let (x, y) = (k % 6, k / 6);
             (1..5).contains(&x)
@@ -117,7 +117,7 @@ mod tests {
         };
         let pixels: Vec<bool> = (0..36).map(set).collect();
         let polygon = outline(&pixels, [6, 6]);
-        // Four corners each, and the seam's two ends again.
+        // Four corners of each loop, plus both ends of the seam.
         assert_eq!(polygon.len(), 10);
         assert!((0..36).all(|k| is_inside(&polygon, k % 6, k / 6) == pixels[k]));
     }

@@ -1,7 +1,8 @@
-//! `--randomize FILE`: what changes from image to image, within bounds. All of it may be left out: then nothing does.
+//! `--randomize FILE`: bounds of the random changes from image to image. All keys are optional; without them, nothing
+//! changes.
 //!
-//! Drawn for each image from the data set's seed, the scene and the image's number, so that an image is the same whoever
-//! renders it and whenever.
+//! The values of an image only depend on the data set's seed, the scene and the image's number, so that images are
+//! reproducible.
 
 use std::path::Path;
 
@@ -12,7 +13,7 @@ use vizflyt_protocol::geometry::Intrinsics;
 use vizflyt_scenes::DrawBounds;
 use vizflyt_twin::random::Random;
 
-/// The whole file.
+/// Content of the file.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Randomize {
@@ -25,13 +26,13 @@ pub(super) struct Randomize {
     pub(super) camera: CameraBounds,
 }
 
-/// Factors of the scene's own colours.
+/// Factors on the scene's colours.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Light {
-    /// Least and greatest, evenly by their logarithm; 0.05 to 4.
+    /// Minimum and maximum brightness, log-uniform; 0.05 to 4.
     pub(super) brightness: [f64; 2],
-    /// Each colour by up to this share more or less; 0 to 0.9.
+    /// Maximum relative change of each colour channel; 0 to 0.9.
     pub(super) tint: f64,
 }
 
@@ -40,7 +41,7 @@ pub(super) struct Light {
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Fog {
     pub(super) probability: f64,
-    /// How far one sees, evenly by its logarithm; 0.5 to 1000. [m]
+    /// Range of the visibility, log-uniform; 0.5 to 1000. [m]
     pub(super) visibility_m: [f64; 2],
 }
 
@@ -48,48 +49,48 @@ pub(super) struct Fog {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Gates {
-    /// That a gate has another texture than its own.
+    /// Probability that a gate has a random texture.
     pub(super) probability: f64,
-    /// How many there are of each gate and scene; 1 to 32.
+    /// Number of random textures for each gate and scene; 1 to 32.
     pub(super) textures: usize,
 }
 
-/// Plain solids that float in the free space.
+/// Plain solids in the free space.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Distractors {
-    /// How many at least and at most; up to 64.
+    /// Minimum and maximum number; up to 64.
     pub(super) count: [usize; 2],
-    /// Their greatest side. [m]
+    /// Range of the largest side. [m]
     pub(super) size_m: [f64; 2],
 }
 
-/// Weather and its light, in the place of `light` and `fog`.
+/// Weather with its light, instead of `light` and `fog`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct WeatherBounds {
-    /// Of an image; 0 to 1.
+    /// Probability per image; 0 to 1.
     pub(super) probability: f64,
-    /// What it is drawn from, as `[environments]` of a project has it.
+    /// Bounds of the weather, as in `[environments]` of a project.
     pub(super) within: DrawBounds,
 }
 
-/// Other vehicles that hover in the free space.
+/// Other vehicles in the free space.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Vehicles {
-    /// How many at least and at most; up to 64.
+    /// Minimum and maximum number; up to 64.
     pub(super) count: [usize; 2],
 }
 
-/// What differs between cameras of a kind.
+/// Variation of the intrinsics.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct CameraBounds {
-    /// Horizontal field of view in place of --fov; 10 to 150. [deg]
+    /// Horizontal field of view instead of --fov; 10 to 150. [deg]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) fov_deg: Option<[f64; 2]>,
-    /// The optical axis is up to this share of the image's size beside its middle; 0 to 0.3.
+    /// Maximum offset of the principal point from the centre, relative to the image size; 0 to 0.3.
     pub(super) center: f64,
 }
 
@@ -118,10 +119,10 @@ impl Default for Distractors {
 }
 
 impl Randomize {
-    /// Reads a file.
+    /// Reads and checks a file.
     ///
     /// # Errors
-    /// What is wrong with it, by its line or its key.
+    /// The file is invalid; the message includes the line or the key.
     pub(super) fn read(path: &Path) -> Result<Self> {
         let context = || format!("cannot use {} as --randomize", path.display());
         let text = std::fs::read_to_string(path).with_context(context)?;
@@ -136,7 +137,7 @@ impl Randomize {
         within("fog.probability", [fog.probability; 2], [0.0, 1.0])?;
         within("fog.visibility_m", fog.visibility_m, [0.5, 1000.0])?;
         within("weather.probability", [weather.probability; 2], [0.0, 1.0])?;
-        weather.within.check().context("of [weather.within]")?;
+        weather.within.check().context("in [weather.within]")?;
         within("gates.probability", [gates.probability; 2], [0.0, 1.0])?;
         within("gates.textures", [gates.textures as f64; 2], [1.0, 32.0])?;
         within("distractors.count", distractors.count.map(|n| n as f64), [0.0, 64.0])?;
@@ -147,19 +148,19 @@ impl Randomize {
         Ok(file)
     }
 
-    /// Returns how many textures a gate has beside its own.
+    /// Returns the number of random textures of a gate.
     pub(super) fn textures(&self) -> usize {
         if self.gates.probability > 0.0 { self.gates.textures } else { 0 }
     }
 
-    /// Draws light and fog, beside those of the arena.
+    /// Draws light, fog or weather, applied to the environment of the arena.
     pub(super) fn environment(
         &self,
         arena: &EnvironmentConfig,
         random: &mut Random,
     ) -> EnvironmentConfig {
         let weather = &self.weather;
-        // Nothing is drawn for what is left out: the rest of the image stays what it was without it.
+        // Without weather, no random number is drawn here, so that the rest of the image stays the same.
         if weather.probability > 0.0 && f64::from(random.unit()) < weather.probability {
             return weather.within.draw(random.bits(), 0);
         }
@@ -173,13 +174,13 @@ impl Randomize {
         if !is_foggy {
             return EnvironmentConfig { light, ..*arena };
         }
-        // Fog is lit as the scene is.
+        // The scene's light also applies to fog.
         let lit = |k: usize| (EnvironmentConfig::default().fog[k] * light[k]).clamp(0.0, 1.0);
         let fog = [lit(0), lit(1), lit(2)];
         EnvironmentConfig { light, fog_visibility_m: visibility_m, fog, ..*arena }
     }
 
-    /// Draws the intrinsics of a camera that has these without it.
+    /// Draws intrinsics around the given ones.
     pub(super) fn intrinsics(&self, plain: Intrinsics, random: &mut Random) -> Intrinsics {
         let (width, height) = (plain.width_px, plain.height_px);
         let mut drawn = plain;
@@ -194,17 +195,17 @@ impl Randomize {
     }
 }
 
-/// Draws a number evenly from a range.
+/// Draws a number from a range, uniformly.
 pub(super) fn range(random: &mut Random, [low, high]: [f64; 2]) -> f64 {
     low + (high - low) * f64::from(random.unit())
 }
 
-/// Draws a number from a range, evenly by its logarithm.
+/// Draws a number from a range, log-uniformly.
 pub(super) fn log_range(random: &mut Random, bounds: [f64; 2]) -> f64 {
     range(random, bounds.map(f64::ln)).exp()
 }
 
-/// Draws a whole number from a range, both ends included.
+/// Draws an integer from a range, both ends included.
 pub(super) fn count(random: &mut Random, [least, most]: [usize; 2]) -> usize {
     least + random.below(most - least + 1)
 }
@@ -225,7 +226,7 @@ mod tests {
     const EXAMPLE: &str = include_str!("../../../../docs/guides/randomize.toml");
 
     #[test]
-    fn the_guides_example_is_read_and_changes_everything() {
+    fn the_example_of_the_guide_uses_all_tables() {
         let file = Randomize::parse(EXAMPLE).unwrap();
         let still = Randomize::default();
         assert!(file.light != still.light && file.fog != still.fog && file.gates != still.gates);
@@ -246,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn draws_are_valid_and_within_their_bounds() {
+    fn draws_valid_values_within_the_bounds() {
         let file = Randomize::parse(EXAMPLE).unwrap();
         let plain = Intrinsics::from_horizontal_fov(320, 240, 1.2);
         let (mut foggy, mut wet) = (0, 0);
@@ -264,7 +265,7 @@ mod tests {
                     .contains(&count(&mut random, file.distractors.count))
             );
         }
-        // One kind of weather of seven is fog, two are wet.
+        // One of seven kinds of weather is fog, and two are wet.
         let [foggy, wet] = [foggy, wet].map(|count| f64::from(count) / 2000.0);
         let weather = file.weather.probability;
         let expected = file.fog.probability * (1.0 - weather) + weather / 7.0;
@@ -273,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn bounds_that_cannot_work_are_named() {
+    fn errors_name_the_invalid_bounds() {
         for (text, told) in [
             ("[light]\nbrightness = [2, 1]", "light.brightness = [2, 1]"),
             ("[fog]\nprobability = 1.5", "fog.probability = 1.5"),
@@ -291,7 +292,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_text_is_read_or_refused(text in "(\\[(light|fog|gates|camera)\\]\n)?[a-z_=\\[\\]0-9., \n-]{0,120}") {
+        fn never_panics_on_any_text(text in "(\\[(light|fog|gates|camera)\\]\n)?[a-z_=\\[\\]0-9., \n-]{0,120}") {
             let _ = Randomize::parse(&text);
         }
     }

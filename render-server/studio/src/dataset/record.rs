@@ -1,7 +1,8 @@
-//! What is known of an image, beside its pixels: `records/SPLIT/N.json`. Written last of an image's files, so that an image
-//! whose record is there is whole; indices of all formats are made of records alone.
+//! Record of an image: `records/SPLIT/N.json`. It is the last file of an image, so that an image with a record is
+//! complete. The annotations of all formats are generated from records.
 //!
-//! Pixels are continuous: (0, 0) is the image's upper left corner, the first pixel's middle (0.5, 0.5).
+//! Pixel coordinates are continuous: (0, 0) is the upper left corner of the image, (0.5, 0.5) the centre of the first
+//! pixel.
 
 use serde::{Deserialize, Serialize};
 use vizflyt_arena::config::EnvironmentConfig;
@@ -10,40 +11,40 @@ use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World as WorldFrame};
 use super::shot::numbers;
 use super::store::ImageName;
 
-/// The whole record.
+/// Content of a record.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ImageRecord {
-    /// From 0, over the whole data set.
+    /// Index in the whole data set, from 0.
     pub(super) index: u64,
     /// `train` or `val`.
     pub(super) split: String,
     pub(super) scene: String,
-    /// Of the scene.
+    /// Seed of the scene.
     pub(super) seed: u64,
-    /// Of the scene's clock. [ns]
+    /// Time of the scene's clock. [ns]
     pub(super) at_ns: i64,
     pub(super) camera: CameraRecord,
     pub(super) world_from_cam: PoseRecord,
-    /// Where optical flow leads to; none at the end of a path.
+    /// Camera at the second time of the optical flow; none at the end of a path.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) next: Option<NextRecord>,
     pub(super) environment: EnvironmentConfig,
-    /// Things that are seen, by their ids.
+    /// Visible things, in order of their ids.
     pub(super) things: Vec<ThingRecord>,
-    /// Gates that are seen, and those a corner of which is in the image though hidden, in the order of the course.
+    /// Gates that are visible or have a (possibly hidden) corner in the image, in the order of the course.
     pub(super) gates: Vec<GateRecord>,
 }
 
 impl ImageRecord {
-    /// Returns what names its files.
+    /// Returns the data for the names of the image's files.
     pub(super) fn name(&self) -> ImageName<'_> {
         let Self { index, split, scene, at_ns, .. } = self;
         ImageName { index: *index, split, scene, at_ns: *at_ns }
     }
 }
 
-/// A pinhole.
+/// Intrinsics of a pinhole camera.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct CameraRecord {
@@ -61,7 +62,7 @@ impl CameraRecord {
         Self { width_px, height_px, fx_px, fy_px, cx_px, cy_px }
     }
 
-    /// Returns them as the renderer takes them.
+    /// Returns the intrinsics for the renderer.
     pub(super) fn intrinsics(&self) -> Intrinsics {
         let Self { width_px, height_px, fx_px, fy_px, cx_px, cy_px } = *self;
         let distortion = vizflyt_protocol::geometry::Distortion::None;
@@ -69,13 +70,13 @@ impl CameraRecord {
     }
 }
 
-/// `a_from_b`: takes points of b to a.
+/// Pose `a_from_b`: transforms points from frame b to frame a.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct PoseRecord {
     /// [m]
     pub(super) p_m: [f64; 3],
-    /// Unit, Hamilton.
+    /// Unit quaternion, Hamilton convention.
     pub(super) q_xyzw: [f64; 4],
 }
 
@@ -90,54 +91,54 @@ impl PoseRecord {
     }
 }
 
-/// The camera a moment later.
+/// Camera at the second time of the optical flow.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct NextRecord {
-    /// Of the scene's clock. [ns]
+    /// Time of the scene's clock. [ns]
     pub(super) at_ns: i64,
     pub(super) world_from_cam: PoseRecord,
 }
 
-/// A thing in the image.
+/// Thing in the image.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ThingRecord {
-    /// What the instance mask has where it is seen.
+    /// Value of its pixels in the instance mask.
     pub(super) id: u16,
     pub(super) name: String,
     pub(super) class: String,
     pub(super) area_px: u32,
-    /// Left, top, width, height; tight. [px]
+    /// Tight box: left, top, width, height. [px]
     pub(super) box_px: [u32; 4],
-    /// Its mask as run lengths, COCO's text.
+    /// Mask as compressed RLE text of COCO.
     pub(super) rle: String,
 }
 
-/// A gate of the course.
+/// Gate of the course.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct GateRecord {
-    /// Of its stage.
+    /// Name of its stage.
     pub(super) name: String,
-    /// Of its thing; 0 if no splats are known to be its own.
+    /// Id of its thing; 0 if its splats are unknown.
     pub(super) id: u16,
-    /// Middle of the opening; x along the passage, y to the left, z up.
+    /// Pose of the opening's centre: x along the passage, y to the left, z up.
     pub(super) cam_from_gate: PoseRecord,
     /// Width and height of the opening. [m]
     pub(super) size_m: [f64; 2],
-    /// Of the opening, as one sees them who flies through: upper left, upper right, lower right, lower left.
+    /// Corners of the opening as seen by an approaching vehicle: upper left, upper right, lower right, lower left.
     pub(super) corners: [CornerRecord; 4],
 }
 
-/// A corner of a gate.
+/// Corner of a gate.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct CornerRecord {
-    /// Where it is; [0, 0] behind the camera. [px]
+    /// Position in the image; [0, 0] if it is behind the camera. [px]
     pub(super) at_px: [f64; 2],
-    /// Along the optical axis. [m, cam]
+    /// Depth along the optical axis. [m, cam]
     pub(super) depth_m: f64,
-    /// As COCO has it: 0 not in the image, 1 in it but hidden, 2 seen.
+    /// Visibility of COCO: 0 not in the image, 1 in the image but hidden, 2 visible.
     pub(super) visibility: u8,
 }

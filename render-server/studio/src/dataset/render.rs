@@ -1,4 +1,4 @@
-//! One image with all of its layers: a function of the scene and the shot, on one thread.
+//! Renders an image with all layers: a function of the scene and the shot, on one thread.
 
 use anyhow::Result;
 use glam::DVec3;
@@ -17,7 +17,7 @@ use crate::labels::flow::Flow;
 use crate::labels::normals::Normals;
 use crate::labels::{layers, rle};
 
-/// Renders one scene; a thread of its own has each.
+/// Renderer of a scene; each thread has one.
 pub(super) struct LabelRenderer<'a> {
     world: &'a World,
     renderer: CpuRenderer,
@@ -26,29 +26,29 @@ pub(super) struct LabelRenderer<'a> {
     normals: Normals,
     flow: Flow,
     class_of_id: Vec<u8>,
-    /// Whether an id is one of a thing.
+    /// Whether an id belongs to a thing.
     is_thing: Vec<bool>,
 }
 
-/// All layers, row-major; those that were not asked for are empty.
+/// All layers, row-major. Layers that are not requested are empty.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Layers {
     /// H x W x 3, sRGB.
     pub(super) rgb: Vec<u8>,
-    /// The same at the instant and place that optical flow leads to.
+    /// Colours at the second time and pose of the optical flow.
     pub(super) next: Vec<u8>,
-    /// Of surfaces; 0 is none. [m, cam]
+    /// Depth of surfaces; 0: none. [m, cam]
     pub(super) depth_m: Vec<f32>,
     /// H x W x 3; see [`Normals::write`].
     pub(super) normals: Vec<u8>,
-    /// Ids of things; 0 of surroundings.
+    /// Ids of things; 0 for surroundings.
     pub(super) instances: Vec<u16>,
     pub(super) classes: Vec<u8>,
     /// H x W x 3; see [`Flow::write`].
     pub(super) flow: Vec<u16>,
 }
 
-/// Which of the layers are made.
+/// Requested layers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Wanted {
     pub(super) next: bool,
@@ -58,7 +58,7 @@ pub(super) struct Wanted {
 }
 
 impl<'a> LabelRenderer<'a> {
-    /// Packs a scene.
+    /// Prepares the renderer of a scene.
     pub(super) fn new(world: &'a World, classes: &Classes) -> Self {
         let scene = Scene { splats: &world.rest, objects: &world.objects };
         let class_of_id = world.class_of_id();
@@ -79,7 +79,7 @@ impl<'a> LabelRenderer<'a> {
     /// Renders a shot.
     ///
     /// # Errors
-    /// A pose or intrinsics that the renderer refuses.
+    /// The renderer rejects the pose or the intrinsics.
     pub(super) fn render(&mut self, shot: &Shot, wanted: Wanted, out: &mut Layers) -> Result<()> {
         let world = self.world;
         let k = &shot.intrinsics;
@@ -135,7 +135,7 @@ impl<'a> LabelRenderer<'a> {
         Ok(())
     }
 
-    /// Returns what is known of an image that was just rendered.
+    /// Returns the record of the image that was just rendered.
     pub(super) fn record(
         &self,
         shot: &Shot,
@@ -186,7 +186,7 @@ impl<'a> LabelRenderer<'a> {
     }
 }
 
-/// Returns a gate's pose and corners.
+/// Returns the record of a gate: pose and corners.
 fn gate_record(gate: &Gate, shot: &Shot, depth_m: &[f32]) -> GateRecord {
     let cam_from_world = shot.world_from_cam.inverse();
     let corners = gate.corners_m().map(|corner_m| {
@@ -203,7 +203,7 @@ fn gate_record(gate: &Gate, shot: &Shot, depth_m: &[f32]) -> GateRecord {
     }
 }
 
-/// Whether a point is seen: no surface of its pixel is well before it.
+/// Returns the record of a corner. It is hidden if the surface in its pixel is well in front of it.
 fn corner(
     k: &vizflyt_protocol::geometry::Intrinsics,
     p_cam: glam::DVec3,
@@ -216,7 +216,7 @@ fn corner(
     let is_inside = (0.0..width).contains(&pixel.x) && (0.0..height).contains(&pixel.y);
     let visibility = if is_inside {
         let seen_m = depth_m[pixel.y as usize * k.width_px as usize + pixel.x as usize];
-        // What nothing covers hides nothing.
+        // A pixel without a surface hides nothing.
         let is_hidden = seen_m > 0.0 && f64::from(seen_m) < p_cam.z - HIDDEN_M;
         if is_hidden { 1 } else { 2 }
     } else {
@@ -225,8 +225,8 @@ fn corner(
     CornerRecord { at_px: pixel.to_array(), depth_m: p_cam.z, visibility }
 }
 
-/// As cameras of arenas have it. [m]
+/// Near limit, as for cameras of arenas. [m]
 const NEAR_M: f32 = 0.05;
-/// A corner lies in the middle of its bars' thickness, and is not hidden by half of that seen aslant; what hides it is at least
-/// this far before it. [m]
+/// Minimum distance of a hiding surface in front of a corner. A corner is in the middle of its bars, and half of their
+/// thickness, seen at an angle, must not hide it. [m]
 const HIDDEN_M: f64 = 0.12;

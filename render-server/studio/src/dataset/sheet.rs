@@ -1,7 +1,7 @@
-//! `--sheet FILE`: a few images with all of their layers, to look at.
+//! `--sheet FILE`: overview of a few images with all layers.
 //!
-//! A row for each image: colour with boxes and corners, depth (near is bright), normals, instances, classes, flow by its
-//! direction (as Baker et al. 2011 colour it).
+//! One row per image: colour with boxes and corners, depth (near is bright), normals, instances, classes, flow coloured
+//! by direction (as in Baker et al. 2011).
 
 use std::path::Path;
 
@@ -13,10 +13,10 @@ use super::render::Layers;
 use super::store::write_whole;
 use crate::labels::picture;
 
-/// A sheet in the making.
+/// Rows of an overview.
 #[derive(Debug, Default)]
 pub(super) struct Sheet {
-    /// Row-major RGB of each row of the sheet.
+    /// Row-major RGB of each row.
     rows: Vec<Vec<u8>>,
     tile: [usize; 2],
 }
@@ -67,7 +67,7 @@ impl Sheet {
         self.rows.push(row);
     }
 
-    /// Writes it; a name that ends in .jpg is a JPEG.
+    /// Writes the overview as JPEG if the name ends with .jpg or .jpeg, otherwise as PNG.
     pub(super) fn write(&self, path: &Path) -> Result<()> {
         let rgb: Vec<u8> = self.rows.concat();
         let width = (6 * self.tile[0]) as u32;
@@ -79,7 +79,7 @@ impl Sheet {
     }
 }
 
-/// Returns the mean of the pixels that a pixel of the tile is of; black where the layer is not made.
+/// Returns the mean of the image pixels for a pixel of the tile; black if the layer is empty.
 fn averaged(
     rgb: &[u8],
     [width, height]: [usize; 2],
@@ -130,7 +130,7 @@ fn grey(values: impl Iterator<Item = f32>) -> Vec<u8> {
     values.flat_map(|value| [value as u8; 3]).collect()
 }
 
-/// Returns a colour for a number; black for 0. Neighbours differ by the golden ratio of the circle.
+/// Returns a colour for a number; black for 0. Hues of consecutive numbers differ by the golden ratio.
 fn palette(number: u32) -> [u8; 3] {
     if number == 0 { [0; 3] } else { hue(number as f32 * 0.618_034, 0.65, 1.0) }
 }
@@ -151,7 +151,7 @@ fn flow_colour(flow: &[u16]) -> [u8; 3] {
     hue(turns, (u.hypot(v) / FULL_FLOW_PX).min(1.0), 1.0)
 }
 
-/// Width of a tile at most. [px]
+/// Maximum width of a tile. [px]
 const TILE_PX: usize = 200;
-/// Flow of this length has the fullest colour. [px]
+/// Flow of this length has full saturation. [px]
 const FULL_FLOW_PX: f32 = 16.0;

@@ -1,4 +1,4 @@
-//! What each image shows and how: drawn from the data set's seed, the scene's, and the image's number.
+//! Random settings of each image, drawn from the seeds of the data set and the scene, and from the image's number.
 
 use std::f64::consts::{PI, TAU};
 
@@ -16,64 +16,64 @@ use super::randomize::{Randomize, count, range};
 use super::world::{Gate, Slot, World};
 use crate::evaluate::trajectory::Stamped;
 
-/// How poses come about.
+/// Source of poses.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Poses {
-    /// Drawn in the free space.
+    /// Random poses in the free space.
     Random(RandomPoses),
-    /// Along a path; the next one is where optical flow leads to.
+    /// Poses along a path; the optical flow of an image leads to the next one.
     Path { poses: Vec<Stamped>, of: PathOf },
 }
 
-/// What the poses of a path are of.
+/// Frame of the poses of a path.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum PathOf {
-    /// The vehicle's body: x ahead, y left, z up
+    /// Body of the vehicle: x forward, y left, z up
     #[default]
     Body,
-    /// The camera: x right, y down, z ahead
+    /// Camera: x right, y down, z forward
     Camera,
 }
 
-/// Bounds of drawn poses.
+/// Bounds of random poses.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct RandomPoses {
-    /// The camera keeps this from all that is solid, and from the fence. [m]
+    /// Minimum distance of the camera from solid space and from the fence. [m]
     pub(super) clearance_m: f64,
-    /// Pitch and roll are up to this. [deg]
+    /// Maximum pitch and roll. [deg]
     pub(super) tilt_deg: f64,
-    /// That it looks towards a gate.
+    /// Probability that the camera looks towards a gate.
     pub(super) look_at_gate: f64,
-    /// And then is so far from it. [m]
+    /// Range of distances from that gate. [m]
     pub(super) gate_distance_m: [f64; 2],
-    /// Optical flow is to where the camera is so much later. [s]
+    /// Time between the two images of optical flow. [s]
     pub(super) flow_dt_s: f64,
 }
 
-/// When and where a camera is. [ns, on the scene's clock]
+/// Time of the scene's clock and pose of a camera. [ns]
 pub(super) type TimedCamera = (i64, Pose<WorldFrame, Cam>);
 
-/// One image to be.
+/// Settings of an image.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Shot {
-    /// Of the scene's clock. [ns]
+    /// Time of the scene's clock. [ns]
     pub(super) at_ns: i64,
     pub(super) world_from_cam: Pose<WorldFrame, Cam>,
-    /// When and where the camera is next; none at the end of a path.
+    /// Second time and pose for the optical flow; none at the end of a path.
     pub(super) next: Option<TimedCamera>,
     pub(super) intrinsics: Intrinsics,
     pub(super) environment: EnvironmentConfig,
-    /// Of what is where by chance in the weather.
+    /// Seed of random weather, such as the positions of drops.
     pub(super) seed: u64,
-    /// The texture of each gate that has several.
+    /// Texture of each gate with several textures.
     textures: Vec<usize>,
-    /// Of each loose object.
+    /// Placement of each loose object.
     loose: Vec<Placement>,
 }
 
-/// What is the same for all images.
+/// Settings of all images.
 #[derive(Clone, Debug)]
 pub(super) struct Shooting {
     pub(super) seed: u64,
@@ -83,10 +83,10 @@ pub(super) struct Shooting {
 }
 
 impl Shooting {
-    /// Draws image `within` of the `count` of a scene.
+    /// Draws image `within` of the `of` images of a scene.
     ///
     /// # Errors
-    /// No free place for a camera.
+    /// No free pose is found for the camera.
     pub(super) fn shot(&self, world: &World, within: usize, of: usize) -> Result<Shot> {
         let mut random = Random::stream(self.seed ^ world.seed.rotate_left(32), within as u64);
         let intrinsics = self.randomize.intrinsics(self.intrinsics, &mut random);
@@ -109,16 +109,16 @@ impl Shooting {
         Ok(Shot { at_ns, world_from_cam, next, intrinsics, environment, seed, textures, loose })
     }
 
-    /// Returns the instant of image `within` of the `count` of a scene, on the scene's clock. [ns]
+    /// Returns the time of image `within` of the `of` images of a scene, on the scene's clock. [ns]
     pub(super) fn at_ns(&self, within: usize, of: usize) -> i64 {
         match &self.poses {
             Poses::Path { poses, .. } => instant_ns(poses, row(poses, within, of)),
-            // Evenly over the motion of what moves; in this order too, as a sequence of images is.
+            // Evenly over the motion of the objects, and in order, like a sequence of images.
             Poses::Random(_) => within as i64 * PERIOD_NS,
         }
     }
 
-    /// Puts distractors and vehicles before the camera, where there is room.
+    /// Places distractors and vehicles in the free space in front of the camera.
     fn scatter(
         &self,
         world: &World,
@@ -169,7 +169,7 @@ impl Shooting {
 }
 
 impl Shot {
-    /// Returns where every object of the scene is, at an instant of the scene's clock. [ns]
+    /// Returns the placements of all objects of the scene at a time of the scene's clock. [ns]
     pub(super) fn placements(&self, world: &World, at_ns: i64) -> Vec<Placement> {
         let mut loose = self.loose.iter().copied();
         let place = |slot: &Slot| match *slot {
@@ -199,7 +199,7 @@ impl RandomPoses {
         });
         let world_from_body = found.with_context(|| {
             format!(
-                "no place among {TRIES} is {} m from everything; give a smaller --clearance, or another scene",
+                "none of {TRIES} positions has a clearance of {} m; give a smaller --clearance, or another scene",
                 self.clearance_m
             )
         })?;
@@ -236,7 +236,8 @@ impl RandomPoses {
         Pose::new(p_m, attitude(TAU * f64::from(random.unit()), pitch_rad, roll_rad))
     }
 
-    /// Before a gate or, in a quarter of the cases, behind it; it is in the image, mostly not in its middle.
+    /// Draws a pose in front of a gate or, with probability 1/4, behind it. The gate is in the image, mostly
+    /// off-centre.
     fn towards(
         &self,
         gate: &Gate,
@@ -284,7 +285,7 @@ fn on_path(
     (here, (next < poses.len()).then(|| at(next)))
 }
 
-/// Evenly along the path, each pose at most once.
+/// Returns the row of an image: evenly along the path, each pose at most once.
 fn row(poses: &[Stamped], within: usize, of: usize) -> usize {
     within * poses.len() / of.max(1)
 }
@@ -293,30 +294,30 @@ fn instant_ns(poses: &[Stamped], row: usize) -> i64 {
     ((poses[row].at_s - poses[0].at_s) * 1e9).round() as i64
 }
 
-/// Returns a rotation by heading, nose up, right side down. [rad]
+/// Returns a rotation from heading, pitch (nose up) and roll (right side down). [rad]
 fn attitude(yaw_rad: f64, pitch_up_rad: f64, roll_rad: f64) -> DQuat {
     let turn = DQuat::from_rotation_z(yaw_rad) * DQuat::from_rotation_y(-pitch_up_rad);
     (turn * DQuat::from_rotation_x(roll_rad)).normalize()
 }
 
-/// Poses that are tried for an image.
+/// Maximum number of tested poses for an image.
 const TRIES: usize = 2000;
-/// Places that are tried for what floats; then it is left out.
+/// Maximum number of tested positions for a loose object; then it is omitted.
 const TRIES_LOOSE: usize = 12;
-/// How far from the camera what floats is. [m, cam]
+/// Range of distances of loose objects from the camera. [m, cam]
 const LOOSE_M: [f64; 2] = [0.6, 6.0];
-/// Of random poses, from image to image. [ns]
+/// Time between images of random poses. [ns]
 const PERIOD_NS: i64 = 100_000_000;
-/// Motions that optical flow is of: a racing vehicle's. [m/s, rad/s, on each axis]
+/// Maximum speeds for optical flow, as of a racing vehicle. [m/s, rad/s, on each axis]
 const SPEED_MPS: f64 = 2.0;
 const TURN_RADPS: f64 = 1.5;
 
-/// A placement as other programs want it.
+/// Returns position and quaternion (xyzw) of a pose, for files.
 pub(super) fn numbers<A, B>(pose: &Pose<A, B>) -> ([f64; 3], [f64; 4]) {
     (pose.translation_m.to_array(), pose.rotation.to_array())
 }
 
-/// Returns how a thing moved between two placements. [world]
+/// Returns the motion of an object between two placements. [world]
 pub(super) fn motion(
     from: &Pose<WorldFrame, Object>,
     to: &Pose<WorldFrame, Object>,
@@ -353,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn drawn_cameras_are_free_upright_and_see_a_gate() {
+    fn random_cameras_are_free_and_upright_and_see_a_gate() {
         let (world, shooting) = shooting(Poses::Random(BOUNDS));
         let mut seen = 0;
         for within in 0..60 {
@@ -361,7 +362,7 @@ mod tests {
             assert_eq!(shot, shooting.shot(&world, within, 60).unwrap());
             let p_m = shot.world_from_cam.translation_m;
             assert!(world.free.is_free(shot.at_ns, p_m, 0.25));
-            // Up in the image is up.
+            // The upper side of the image points up.
             assert!(shot.world_from_cam.rotate(DVec3::NEG_Y).z > 0.7);
             let cam_from_world = shot.world_from_cam.inverse();
             let in_image = |gate: &Gate| {
@@ -383,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_is_followed_evenly() {
+    fn poses_are_evenly_spaced_along_a_path() {
         let stamped = |n: u32| Stamped {
             at_s: 100.0 + f64::from(n),
             position_m: DVec3::new(f64::from(n), 0.0, 1.0),
@@ -398,7 +399,7 @@ mod tests {
         assert_eq!(shots[1].at_ns, 2_000_000_000);
         assert_eq!(shots[1].next.unwrap().1, shots[2].world_from_cam);
         assert!(shots[4].next.is_none());
-        // The body's nose is the camera's axis.
+        // The optical axis is the body's forward axis.
         assert!((shots[0].world_from_cam.rotate(DVec3::Z) - DVec3::X).length() < 1e-12);
     }
 }

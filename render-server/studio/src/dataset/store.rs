@@ -1,11 +1,11 @@
-//! The folder of a data set: where each file is, what it was asked to be, and what of it is there.
+//! Folder of a data set: paths of its files, requested settings, and completed images.
 //!
 //! ```text
-//! dataset.json                                  what was asked for: asked again, it goes on
-//! images/SPLIT/000000.png  depth/... flow/...   a folder for each layer
-//! records/SPLIT/000000.json                     last of an image's files
+//! dataset.json                                  settings; with the same settings, the data set is resumed
+//! images/SPLIT/000000.png  depth/... flow/...   folder of each layer
+//! records/SPLIT/000000.json                     last file of an image
 //! ```
-//! EuRoC's layout has `SCENE/mav0/cam0/data/NS.png`, `depth0` and so on in place of `images/SPLIT`.
+//! EuRoC's layout has `SCENE/mav0/cam0/data/NS.png`, `depth0` and others instead of `images/SPLIT`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -17,43 +17,43 @@ use serde_json::Value;
 
 use super::record::ImageRecord;
 
-/// A layer of pixels.
+/// A layer of an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Layer {
-    /// Colour, 8 bits each
+    /// Colour, 8 bits per channel
     Rgb,
-    /// Colour a moment later, where optical flow leads to
+    /// Second colour image, at the time to which the optical flow leads
     Next,
-    /// 16-bit PNG of millimetres along the optical axis, 0 is none
+    /// Depth along the optical axis in mm, 16-bit PNG; 0: no depth
     Depth,
-    /// Normals of surfaces in the camera's axes, 127.5 (n + 1)
+    /// Surface normals in the camera's axes, encoded as 127.5 (n + 1)
     Normals,
-    /// 16-bit PNG of the ids of things
+    /// Ids of things, 16-bit PNG
     Instances,
-    /// 8-bit PNG of classes
+    /// Classes, 8-bit PNG
     Classes,
-    /// Optical flow as KITTI's 16-bit PNG
+    /// Optical flow, KITTI's 16-bit PNG
     Flow,
 }
 
-/// Whose layout.
+/// Layout of the data set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Format {
-    /// annotations/instances_train.json: boxes, masks as RLE, corners of gates
+    /// COCO: boxes, masks as RLE, corners of gates (annotations/instances_train.json)
     Coco,
-    /// labels/train/N.txt: boxes
+    /// YOLO boxes (labels/train/N.txt)
     Yolo,
-    /// labels/train/N.txt: polygons
+    /// YOLO polygons (labels/train/N.txt)
     YoloSeg,
-    /// labels/train/N.txt: gates with their corners
+    /// YOLO gates with corners (labels/train/N.txt)
     YoloPose,
-    /// SCENE/mav0: cam0, depth0, state_groundtruth_estimate0
+    /// EuRoC: SCENE/mav0 with cam0, depth0, state_groundtruth_estimate0
     Euroc,
 }
 
-/// Where images are.
+/// Folder and layout of a data set.
 #[derive(Clone, Debug)]
 pub(super) struct Store {
     root: PathBuf,
@@ -61,7 +61,7 @@ pub(super) struct Store {
     jpeg: bool,
 }
 
-/// What names the files of an image.
+/// Data for the names of an image's files.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ImageName<'a> {
     pub(super) index: u64,
@@ -71,22 +71,22 @@ pub(super) struct ImageName<'a> {
 }
 
 impl Store {
-    /// Opens a folder for what is asked for; makes it if it is not there.
+    /// Opens or creates the folder for the requested settings.
     ///
     /// # Errors
-    /// It holds something else, or what was asked for differently.
+    /// The folder contains other files, or a data set with other settings.
     pub(super) fn open(root: &Path, format: Format, jpeg: bool, asked: &Value) -> Result<Self> {
         let path = root.join(ASKED);
         let text = serde_json::to_string_pretty(asked)? + "\n";
-        // Numbers as they are read again, which may be off by a last bit.
+        // Compare numbers after a round trip, which may change the last bit.
         let asked: &Value = &serde_json::from_str(&text)?;
         match fs::read(&path) {
             Ok(bytes) => {
                 let there: Value = serde_json::from_slice(&bytes)
-                    .with_context(|| format!("{} is no data set's", path.display()))?;
+                    .with_context(|| format!("{} is not of a data set", path.display()))?;
                 if let Some(key) = difference(&there, asked) {
                     bail!(
-                        "{} holds another data set: {key} is {}, and {} is asked for; give another folder, or the same \
+                        "{} contains another data set: {key} is {}, but {} is requested; give another folder, or the same \
                          options",
                         root.display(),
                         at_key(&there, &key),
@@ -98,7 +98,7 @@ impl Store {
                 let is_used = fs::read_dir(root).is_ok_and(|mut entries| entries.next().is_some());
                 if is_used {
                     bail!(
-                        "{} is not empty and holds no {ASKED}; give another folder",
+                        "{} is not empty and has no {ASKED}; give another folder",
                         root.display()
                     );
                 }
@@ -115,7 +115,7 @@ impl Store {
         &self.root
     }
 
-    /// Returns where a layer of an image is, from the data set's folder.
+    /// Returns the path of a layer of an image, relative to the data set's folder.
     pub(super) fn layer(&self, layer: Layer, name: &ImageName<'_>) -> String {
         let is_colour = matches!(layer, Layer::Rgb | Layer::Next);
         let ending = if is_colour && self.jpeg { "jpg" } else { "png" };
@@ -131,7 +131,7 @@ impl Store {
         self.file(folder, sensor, name, ending)
     }
 
-    /// Returns where an image's record is, from the data set's folder.
+    /// Returns the path of an image's record, relative to the data set's folder.
     pub(super) fn record(&self, name: &ImageName<'_>) -> String {
         self.file("records", "records0", name, "json")
     }
@@ -144,18 +144,18 @@ impl Store {
         }
     }
 
-    /// Whether an image is whole.
+    /// Whether an image is complete.
     pub(super) fn has(&self, name: &ImageName<'_>) -> bool {
         self.root.join(self.record(name)).is_file()
     }
 
-    /// Writes a file of a layer; makes the folders above.
+    /// Writes a file of a layer, and creates its parent folders.
     pub(super) fn write(&self, file: &str, bytes: &[u8]) -> Result<()> {
         let path = self.root.join(file);
         let write = || fs::write(&path, bytes);
         write()
             .or_else(|error| {
-                // The first of its folder.
+                // The parent folder is missing for its first file.
                 let above = path.parent().filter(|_| error.kind() == std::io::ErrorKind::NotFound);
                 above.map_or(Err(error), fs::create_dir_all)?;
                 write()
@@ -163,15 +163,15 @@ impl Store {
             .with_context(|| format!("cannot write {}", path.display()))
     }
 
-    /// Writes an image's record: it is whole from then on.
+    /// Writes the record of an image, which marks it as complete.
     pub(super) fn finish(&self, name: &ImageName<'_>, record: &ImageRecord) -> Result<()> {
         write_whole(&self.root.join(self.record(name)), &serde_json::to_vec(record)?)
     }
 
-    /// Reads an image's record.
+    /// Reads the record of an image.
     ///
     /// # Errors
-    /// It is not there, or not of this version.
+    /// The record does not exist, or is of another version.
     pub(super) fn read(&self, name: &ImageName<'_>) -> Result<ImageRecord> {
         let path = self.root.join(self.record(name));
         let context = || format!("cannot use {}; delete it, and run again", path.display());
@@ -180,7 +180,7 @@ impl Store {
     }
 }
 
-/// Writes a file under another name and renames it, so that what is there is whole.
+/// Writes a file atomically: under a temporary name, then renamed.
 pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     let context = || format!("cannot write {}", path.display());
     if let Some(above) = path.parent() {
@@ -191,7 +191,7 @@ pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     fs::rename(&part, path).with_context(context)
 }
 
-/// Returns the first key that differs: `poses.tilt_deg`.
+/// Returns the first key with different values, such as `poses.tilt_deg`.
 fn difference(there: &Value, asked: &Value) -> Option<String> {
     match (there, asked) {
         (Value::Object(a), Value::Object(b)) => {
@@ -225,7 +225,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_is_of_one_data_set() {
+    fn accepts_only_the_same_data_set_in_a_folder() {
         let folder = tempfile::tempdir().unwrap();
         let asked = json!({"seed": 1, "poses": {"tilt_deg": 10.0}});
         let root = folder.path().join("set");
@@ -237,17 +237,17 @@ mod tests {
         };
         let other = json!({"seed": 1, "poses": {"tilt_deg": 15.0}});
         let told = refused(&root, &other);
-        assert!(told.contains("poses.tilt_deg is 10.0, and 15.0 is asked for"), "{told}");
+        assert!(told.contains("poses.tilt_deg is 10.0, but 15.0 is requested"), "{told}");
         let told = refused(&root, &json!({"seed": 1, "poses": {"tilt_deg": 10.0}, "val": 0.2}));
-        assert!(told.contains("val is null, and 0.2 is asked for"), "{told}");
+        assert!(told.contains("val is null, but 0.2 is requested"), "{told}");
         std::fs::write(folder.path().join("notes.txt"), "x").unwrap();
         assert!(refused(folder.path(), &asked).contains("is not empty"));
         std::fs::write(root.join(ASKED), "{").unwrap();
-        assert!(refused(&root, &asked).contains("is no data set's"));
+        assert!(refused(&root, &asked).contains("is not of a data set"));
     }
 
     #[test]
-    fn files_have_their_places() {
+    fn paths_depend_on_format_and_layer() {
         let folder = tempfile::tempdir().unwrap();
         let name = ImageName { index: 12, split: "val", scene: "p3-7", at_ns: 300 };
         let store = |format, jpeg| {

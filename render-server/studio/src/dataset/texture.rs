@@ -1,10 +1,10 @@
-//! Other textures for gates: patterns of two colours over the splats that a gate has, lit by their direction.
+//! Random textures for gates: patterns of two colours on the splats of a gate, shaded by their direction.
 
 use glam::{Vec3, Vec3Swizzles};
 use vizflyt_splat::Splats;
 use vizflyt_twin::random::Random;
 
-/// Returns the splats with another texture, drawn: plain, stripes or checks in two colours.
+/// Returns the splats with a random texture: plain, stripes or checks in two colours.
 pub(super) fn retextured(splats: &Splats, random: &mut Random) -> Splats {
     let mut painted = splats.clone();
     let colours = [colour(random), colour(random)];
@@ -30,7 +30,7 @@ pub(super) fn retextured(splats: &Splats, random: &mut Random) -> Splats {
     painted
 }
 
-/// Returns a colour as displayed, of any hue.
+/// Draws a display colour of any hue.
 pub(super) fn colour(random: &mut Random) -> Vec3 {
     let hue = random.unit() * 6.0;
     let (saturation, value) = (random.unit(), random.within(0.15, 1.0));
@@ -42,7 +42,7 @@ pub(super) fn colour(random: &mut Random) -> Vec3 {
     Vec3::new(channel(5.0), channel(3.0), channel(1.0))
 }
 
-/// Returns the direction in which a splat is thin.
+/// Returns the direction of the smallest extent of a splat.
 fn outward(splats: &Splats, i: usize) -> Vec3 {
     splats.rotations[i] * Vec3::AXES[splats.scales_m[i].min_position()]
 }
@@ -57,7 +57,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn colours_alone_change_and_differ_from_draw_to_draw() {
+    fn changes_only_colours_and_differs_between_draws() {
         let splats = boxes(&QUADROTOR);
         let painted: Vec<Splats> =
             (0..4).map(|n| retextured(&splats, &mut Random::stream(5, n))).collect();
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_are_of_every_hue() {
+    fn draws_colours_of_all_hues() {
         let mut random = Random::new(1);
         let mut strongest = [0; 3];
         for _ in 0..3000 {

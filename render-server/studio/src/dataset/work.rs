@@ -1,4 +1,4 @@
-//! The work: scenes one after the other, their images on all threads, what is there already left out.
+//! Rendering of a data set: scenes one after the other, with their images on all threads. Complete images are skipped.
 
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -21,9 +21,9 @@ use super::world::World;
 use crate::labels::{layers, picture};
 use crate::shard::Shard;
 
-/// What is to be rendered, checked.
+/// Checked settings of a data set.
 pub(super) struct Plan {
-    /// What the bytes depend on.
+    /// Settings that determine the files, for `dataset.json`.
     pub(super) asked: Value,
     pub(super) source: SceneSource,
     pub(super) parts: PartsFile,
@@ -41,25 +41,25 @@ pub(super) struct Plan {
     pub(super) threads: Option<usize>,
 }
 
-/// Where scenes are from.
+/// Source of the scenes.
 pub(super) enum SceneSource {
     Project(Box<CourseProject>),
     Scene(PathBuf, BareArgs),
 }
 
-/// What was done.
+/// Rendered images and times.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Rendered {
     pub(super) images: usize,
-    /// Rendering and writing, without the making of scenes.
+    /// Time for rendering and writing, without the preparation of scenes. [s]
     pub(super) seconds: f64,
     pub(super) processor_seconds: f64,
 }
 
 impl Plan {
-    /// Returns which of the scenes an image is of, from 0.
+    /// Returns the index of an image's scene, from 0.
     fn scene(&self, index: u64) -> u64 {
-        // The greatest whose first image is not behind it.
+        // The last scene with its first image at or before `index`.
         ((index + 1) * u64::from(self.seeds)).div_ceil(self.images) - 1
     }
 
@@ -69,7 +69,7 @@ impl Plan {
         first(scene)..first(scene + 1)
     }
 
-    /// Returns `train` or `val`: the last images are held out, whole scenes of them where there are several.
+    /// Returns `train` or `val`. The last images are held out, or the last complete scenes if there are several.
     pub(super) fn split(&self, index: u64) -> &'static str {
         let held_out = |count: u64| ((count as f64 * self.val).ceil() as u64).min(count - 1);
         let is_val = if self.seeds > 1 {
@@ -81,12 +81,12 @@ impl Plan {
         if is_val { "val" } else { "train" }
     }
 
-    /// Returns the splits that have images.
+    /// Returns the splits with images.
     pub(super) fn splits(&self) -> Vec<&'static str> {
         if self.split(self.images - 1) == "val" { vec!["train", "val"] } else { vec!["train"] }
     }
 
-    /// Calls with what names an image's files.
+    /// Calls `with` with the name data of an image.
     pub(super) fn with_name<T>(&self, index: u64, with: impl FnOnce(&ImageName<'_>) -> T) -> T {
         let scene = self.scene(index);
         let within = (index - self.of_scene(scene).start) as usize;
@@ -99,7 +99,7 @@ impl Plan {
         with(&ImageName { index, split: self.split(index), scene: &scene, at_ns })
     }
 
-    /// Whether an image is whole.
+    /// Whether an image is complete.
     pub(super) fn is_there(&self, store: &Store, index: u64) -> bool {
         self.with_name(index, |name| store.has(name))
     }
@@ -113,7 +113,7 @@ impl Plan {
         self.shooting.seed.wrapping_add(scene)
     }
 
-    /// Whether an image is of the part that is asked for; parts are of images in a row, to make few scenes.
+    /// Whether an image belongs to the requested shard. Shards are consecutive images, so that each needs few scenes.
     fn is_mine(&self, index: u64) -> bool {
         self.shard.is_none_or(|shard| {
             let part = u128::from(index) * u128::from(shard.count) / u128::from(self.images);
@@ -134,10 +134,10 @@ impl Plan {
     }
 }
 
-/// Renders what is not there.
+/// Renders all missing images.
 ///
 /// # Errors
-/// The first image or scene that fails; what is whole by then stays.
+/// The first image or scene that fails. Complete images stay.
 pub(super) fn render_all(plan: &Plan, store: &Store) -> Result<Rendered> {
     let mut rendered = Rendered::default();
     for scene in 0..u64::from(plan.seeds) {
@@ -182,12 +182,12 @@ fn render_scene(plan: &Plan, store: &Store, world: &World, todo: &[u64]) -> Resu
     std::thread::scope(|scope| {
         for _ in 0..threads {
             scope.spawn(|| {
-                // An image is rendered on one thread: all cores have images of their own.
+                // Each image is rendered on one thread; the cores work on different images.
                 let pool =
                     rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build();
                 let done = pool.context("cannot start a thread").and_then(|_pool| worker());
                 if let Err(error) = done {
-                    // The others stop at their next image.
+                    // The other threads stop before their next image.
                     next.store(todo.len(), Ordering::Relaxed);
                     failed
                         .lock()
@@ -247,7 +247,7 @@ fn encoded(plan: &Plan, layer: Layer, layers: &Layers, size: [u32; 2]) -> Result
     Ok(file?)
 }
 
-/// Renders some images again, with all of their layers, and writes the sheet.
+/// Renders some images again with all layers, and writes the overview.
 pub(super) fn write_sheet(plan: &Plan, path: &Path) -> Result<()> {
     let rows = plan.images.min(SHEET_ROWS);
     let mut sheet = Sheet::default();

@@ -1,12 +1,12 @@
-//! One scene ready to be rendered with labels: its splats cut into things, each an object with an id.
+//! Scene for labelled rendering: its splats are divided into things, each of which is an object with an id.
 //!
 //! ```text
 //! project, seed -> Generated, with its parts \
 //!                                             > World: rest, things, gates, free space
 //! arena or scene file, boxes of --parts -----/
 //! ```
-//! The renderer says for each pixel of which object the splat is that the pixel shows. So a thing that stands still is cut out
-//! of the scene and put back as an object that never moves: its mask is exact, with all that stands before it.
+//! The renderer returns the object id of the visible splat of each pixel. Therefore, static things are cut out of the
+//! scene and added as objects that never move. Their masks are exact, including occlusions.
 
 use std::path::Path;
 
@@ -28,53 +28,53 @@ use super::free_space::{FreeSpace, Solid};
 use super::randomize::{Randomize, range};
 use super::{distractor, texture};
 
-/// A scene, its labels, and where a camera may be.
+/// Scene with labels and free space.
 #[derive(Debug)]
 pub(super) struct World {
-    /// `p3-7`.
+    /// Name, such as `p3-7`.
     pub(super) name: String,
     pub(super) seed: u64,
     pub(super) arena: ArenaConfig,
-    /// What is no thing. [m, world]
+    /// Splats that belong to no thing. [m, world]
     pub(super) rest: Splats,
-    /// What the renderer gets; the id of each is that of its thing.
+    /// Objects for the renderer; each has the id of its thing.
     pub(super) objects: Vec<RigidObject>,
-    /// How each object is placed.
+    /// Placement rule of each object.
     pub(super) slots: Vec<Slot>,
-    /// By their ids, from 1.
+    /// Things in order of their ids, from 1.
     pub(super) things: Vec<Thing>,
     pub(super) gates: Vec<Gate>,
     pub(super) movers: MovingObjects,
     pub(super) free: FreeSpace,
 }
 
-/// Something with an id of its own.
+/// Labelled thing with an id.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Thing {
     pub(super) name: String,
     pub(super) class: u8,
 }
 
-/// How an object is placed.
+/// Placement rule of an object.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Slot {
-    /// Where the scene has it.
+    /// At its place in the scene.
     Still,
-    /// There, where this gate (by its number among those with textures) has this texture; 0 is its own.
+    /// Shown if this gate (index among gates with textures) has this texture; 0 is the original one.
     Texture { gate: usize, texture: usize },
-    /// Where its clock has it.
+    /// Moves with the clock of the scene.
     Mover(usize),
-    /// Floats where each image wants it, or is not there. [m]
+    /// Placed randomly in each image, or absent. [m]
     Loose { distractor: bool, radius_m: f64 },
 }
 
-/// An opening to fly through.
+/// Opening to fly through.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Gate {
     pub(super) name: String,
-    /// Of its thing; 0 if there is none of its name.
+    /// Id of its thing; 0 if no thing has its name.
     pub(super) id: u16,
-    /// Middle of the opening; x along the passage, y to the left, z up.
+    /// Pose of the opening's centre: x along the passage, y to the left, z up.
     pub(super) world_from_gate: Pose<WorldFrame, Object>,
     /// Width and height of the opening. [m]
     pub(super) size_m: [f64; 2],
@@ -82,7 +82,7 @@ pub(super) struct Gate {
 
 impl Gate {
     fn of(stage: &StageConfig, things: &[Thing]) -> Self {
-        // As the referee has it (`arena/course`): level, or any way round where the gate lies in the floor.
+        // Same axes as the referee (`arena/course`): y is level; for a gate in the floor, its direction is arbitrary.
         let x = stage.normal.normalize_or(DVec3::X);
         let y = DVec3::Z.cross(x).normalize_or(DVec3::Y);
         let rotation = DQuat::from_mat3(&DMat3::from_cols(x, y, x.cross(y))).normalize();
@@ -95,7 +95,7 @@ impl Gate {
         }
     }
 
-    /// Returns the corners as one sees them who flies through: upper left, upper right, lower right, lower left.
+    /// Returns the corners as seen by an approaching vehicle: upper left, upper right, lower right, lower left.
     /// [m, world]
     pub(super) fn corners_m(&self) -> [DVec3; 4] {
         let [y, z] = self.size_m.map(|side| side / 2.0);
@@ -104,13 +104,13 @@ impl Gate {
     }
 }
 
-/// What is known before it is cut.
+/// Scene before it is divided into things.
 struct Whole {
     name: String,
     seed: u64,
     arena: ArenaConfig,
     splats: Splats,
-    /// The index of each splat's thing.
+    /// Index of the thing of each splat.
     labels: Vec<Option<usize>>,
     things: Vec<Thing>,
     moving: Vec<RigidObject>,
@@ -118,10 +118,10 @@ struct Whole {
 }
 
 impl World {
-    /// Generates a project's scene of a seed.
+    /// Generates the scene of a project for a seed.
     ///
     /// # Errors
-    /// What is wrong with the parts.
+    /// The parts are invalid.
     pub(super) fn generate(
         project: &CourseProject,
         seed: u64,
@@ -151,7 +151,7 @@ impl World {
     /// Loads an arena or a scene file.
     ///
     /// # Errors
-    /// What cannot be read or used.
+    /// A file cannot be read or used.
     pub(super) fn load(
         path: &Path,
         bare: &BareArgs,
@@ -178,7 +178,7 @@ impl World {
             *label = boxed.map(|index| first_box + index).or(*label);
         }
         for part in &parts.parts {
-            let class = classes.number(&part.class).context("a class of --parts is not listed")?;
+            let class = classes.number(&part.class).context("a class of --parts is unknown")?;
             things.push(Thing { name: part.name.clone(), class });
         }
         let still = things.len();
@@ -235,13 +235,13 @@ impl World {
         Ok(Self { name, seed, arena, rest, objects, slots, things, gates, movers, free })
     }
 
-    /// Returns how many gates have textures to choose from.
+    /// Returns the number of gates with random textures.
     pub(super) fn textured_gates(&self) -> usize {
         let of = |slot: &Slot| matches!(slot, Slot::Texture { texture: 0, .. });
         self.slots.iter().filter(|slot| of(slot)).count()
     }
 
-    /// Returns the class of each id; [`classes::SCENE`] of 0.
+    /// Returns the class of each id; [`classes::SCENE`] for id 0.
     pub(super) fn class_of_id(&self) -> Vec<u8> {
         let of_things = self.things.iter().map(|thing| thing.class);
         std::iter::once(classes::SCENE).chain(of_things).collect()
@@ -261,7 +261,7 @@ impl Cut {
     }
 }
 
-/// Returns the splats of each label, in their order.
+/// Returns the indices of the splats of each label, in order.
 fn indices(labels: &[Option<usize>], count: usize) -> Vec<Vec<u32>> {
     let mut found = vec![Vec::new(); count];
     for (i, label) in labels.iter().enumerate() {
@@ -297,7 +297,7 @@ fn radius_m(splats: &Splats) -> f64 {
     f64::from(splats.means_m.iter().map(|p| p.length()).fold(0.0, f32::max))
 }
 
-/// What is drawn once for a scene; images count from 0.
+/// Random stream for values drawn once per scene; streams of images count from 0.
 const SCENE_STREAM: u64 = u64::MAX;
 
 #[cfg(test)]
@@ -314,10 +314,10 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_scene_looks_as_before() {
+    fn dividing_a_scene_does_not_change_its_images() {
         let cut = world("p5", &Randomize::default());
         let whole = CourseProject::named("p5").unwrap().generate(3, Level::Ug, Variant::DAY);
-        // Aslant: patches of a wall that is faced are equally far away, and may change places.
+        // At an angle: patches of a wall seen from the front are equally far away, so that their order could change.
         let turn = DQuat::from_rotation_z(0.21) * DQuat::from_rotation_y(0.07);
         let pose: Pose<WorldFrame, vizflyt_protocol::geometry::Body> =
             Pose::new(DVec3::new(0.9, 0.2, 1.2), turn);
@@ -353,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn gates_are_found_with_their_stages() {
+    fn finds_the_gates_of_all_stages() {
         let world = world("p5", &Randomize::default());
         let names: Vec<&str> = world.gates.iter().map(|gate| &*gate.name).collect();
         assert_eq!(names, ["window 1", "window 2", "gap", "clock hand"]);
@@ -362,13 +362,13 @@ mod tests {
             let [upper_left, upper_right, lower_right, _] = gate.corners_m();
             assert!(((upper_left - upper_right).length() - stage.width_m).abs() < 1e-9);
             assert!(upper_right.z - lower_right.z > 0.99 * stage.height_m);
-            // To the left of the way through.
+            // The upper left corner is to the left of the passage.
             assert!(stage.normal.cross(upper_left - upper_right).z > 0.0);
         }
     }
 
     #[test]
-    fn what_is_drawn_has_slots_of_its_own() {
+    fn random_textures_and_objects_have_separate_slots() {
         let mut how = Randomize::default();
         how.gates.probability = 0.5;
         how.gates.textures = 3;

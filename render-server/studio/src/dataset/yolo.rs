@@ -1,7 +1,7 @@
-//! YOLO's labels, as Ultralytics documents them: `labels/SPLIT/N.txt` beside `images/SPLIT`, and `data.yaml`.
+//! YOLO labels as documented by Ultralytics: `labels/SPLIT/N.txt` next to `images/SPLIT`, and `data.yaml`.
 //!
-//! Positions are shares of the image's width and height, from its upper left corner. Boxes: `class x y w h` of the middle;
-//! polygons: `class x1 y1 x2 y2 ...`, a hole joined by a seam; gates: a box and `x y v` of each corner.
+//! Positions are relative to the image's width and height, from its upper left corner. Boxes: `class x y w h` with the
+//! centre. Polygons: `class x1 y1 x2 y2 ...`, with holes joined by seams. Gates: a box and `x y v` of each corner.
 
 use std::fmt::Write;
 
@@ -13,7 +13,7 @@ use super::record::{GateRecord, ImageRecord, ThingRecord};
 use super::store::{Format, Store, write_whole};
 use crate::labels::rle;
 
-/// Writes all labels of these splits, and the file that names them.
+/// Writes the labels of these splits and `data.yaml`.
 pub(super) fn write(
     store: &Store,
     labelled: &Labelled<'_>,
@@ -71,7 +71,7 @@ fn polygon(
     let pixels = [record.camera.width_px as usize, record.camera.height_px as usize];
     let mask = rle::from_text(&thing.rle).and_then(|counts| rle::to_pixels(&counts, pixels));
     let mask = mask.with_context(|| {
-        format!("the mask of {} in the record of image {} is broken", thing.name, record.index)
+        format!("the mask of {} in the record of image {} is invalid", thing.name, record.index)
     })?;
     let _ = write!(text, "{class}");
     for [x, y] in outline(&mask, pixels) {

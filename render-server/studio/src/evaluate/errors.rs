@@ -1,11 +1,11 @@
-//! How far an estimate is from the truth: absolute and relative errors of a trajectory.
+//! Absolute and relative errors of an estimated trajectory.
 //!
 //! ```text
-//! pairs -> alignment of the estimate -> absolute errors, each pose by itself
-//!                                    -> relative errors, over a way or a time
+//! pairs -> alignment of the estimate -> absolute errors, for each pose
+//!                                    -> relative errors, over a distance or a time
 //! ```
-//! After J. Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012; the numbers are those of the Python
-//! package `evo` (`evo_ape`, `evo_rpe`), as `tests/pose` checks.
+//! Method: J. Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012. The numbers match those
+//! of the Python package `evo` (`evo_ape`, `evo_rpe`), as `tests/pose` checks.
 
 use anyhow::{Context, Result};
 use glam::{DQuat, DVec3};
@@ -13,23 +13,23 @@ use vizflyt_twin::align::{Similarity, points};
 
 use super::pairs::Pair;
 
-/// What of the estimate's frame is taken to be unknown, and is found by least squares.
+/// Unknown part of the estimate's frame, found by least squares.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Alignment {
-    /// Nothing: both are in the same frame
+    /// Nothing: both trajectories are in the same frame
     None,
-    /// Origin and heading: what a camera with an IMU cannot know
+    /// Origin and heading: unobservable for a camera with an IMU
     Yaw,
     /// Origin and rotation
     Se3,
-    /// Origin, rotation and scale: what a single camera cannot know
+    /// Origin, rotation and scale: unobservable for a single camera
     Sim3,
 }
 
 /// Finds the similarity from the estimate's frame to the truth's.
 ///
 /// # Errors
-/// Where the positions do not say it: fewer than three, or all on one line.
+/// The positions do not determine it: fewer than three, or all on one line.
 pub(crate) fn align(pairs: &[Pair], alignment: Alignment) -> Result<Similarity> {
     let still = Similarity { scale: 1.0, rotation: DQuat::IDENTITY, translation_m: DVec3::ZERO };
     let count = pairs.len() as f64;
@@ -43,7 +43,7 @@ pub(crate) fn align(pairs: &[Pair], alignment: Alignment) -> Result<Similarity> 
             world_m: pair.truth.position_m,
         };
         let positions: Vec<points::Pair> = pairs.iter().map(pair).collect();
-        points::closest(&positions).context("it cannot be aligned")
+        points::closest(&positions).context("the estimate cannot be aligned")
     };
     Ok(match alignment {
         Alignment::None => still,
@@ -74,7 +74,7 @@ pub(crate) fn aligned(pairs: &[Pair], truth_from_estimate: &Similarity) -> Vec<P
     pairs
 }
 
-/// An error of a pose: of its place, and of its attitude.
+/// Error of a pose: position and attitude.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Error {
     /// [m]
@@ -83,7 +83,7 @@ pub(crate) struct Error {
     pub turn_rad: f64,
 }
 
-/// Returns each pose's own error.
+/// Returns the error of each pose.
 pub(crate) fn absolute(pairs: &[Pair]) -> Vec<Error> {
     let error = |pair: &Pair| Error {
         place_m: pair.truth.position_m.distance(pair.estimate.position_m),
@@ -92,16 +92,16 @@ pub(crate) fn absolute(pairs: &[Pair]) -> Vec<Error> {
     pairs.iter().map(error).collect()
 }
 
-/// Over what a relative error is taken.
+/// Interval of a relative error.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Delta {
-    /// The estimate's way. [m]
+    /// Path length of the estimate. [m]
     Metres(f64),
     /// [s]
     Seconds(f64),
 }
 
-/// Returns which pairs are compared with which: each begins where the one before it ends.
+/// Returns the steps of relative errors as indices (from, to); each step begins where the previous one ends.
 pub(crate) fn steps(pairs: &[Pair], delta: Delta) -> Vec<(usize, usize)> {
     let mut steps = Vec::new();
     let (mut from, mut way_m) = (0, 0.0);
@@ -110,7 +110,7 @@ pub(crate) fn steps(pairs: &[Pair], delta: Delta) -> Vec<(usize, usize)> {
         way_m += two[0].estimate.position_m.distance(two[1].estimate.position_m);
         let is_far = match delta {
             Delta::Metres(metres) => way_m >= metres,
-            // Half a nanosecond, so that stamps in decimals add up.
+            // Tolerance for the rounding of decimal stamps.
             Delta::Seconds(seconds) => {
                 pairs[to].estimate.at_s - pairs[from].estimate.at_s >= seconds - 5e-7
             }
@@ -123,7 +123,7 @@ pub(crate) fn steps(pairs: &[Pair], delta: Delta) -> Vec<(usize, usize)> {
     steps
 }
 
-/// Returns the error of each step: how the estimate's motion differs from the truth's.
+/// Returns the error of each step: the difference between estimated and true motion.
 pub(crate) fn relative(pairs: &[Pair], steps: &[(usize, usize)]) -> Vec<Error> {
     let error = |&(from, to): &(usize, usize)| {
         let motion = |of: fn(&Pair) -> (DVec3, DQuat)| {
@@ -138,12 +138,12 @@ pub(crate) fn relative(pairs: &[Pair], steps: &[(usize, usize)]) -> Vec<Error> {
     steps.iter().map(error).collect()
 }
 
-/// Exact for small turns too, where the arc cosine of `w` is not.
+/// Returns the angle of a rotation. [rad] Also exact for small angles, unlike the arc cosine of `w`.
 fn angle(turn: DQuat) -> f64 {
     2.0 * turn.xyz().length().atan2(turn.w.abs())
 }
 
-/// What is said of many errors.
+/// Statistics of errors.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Statistics {
     pub rmse: f64,
@@ -153,7 +153,7 @@ pub(crate) struct Statistics {
 }
 
 impl Statistics {
-    /// Of at least one value.
+    /// Returns the statistics, or `None` if there are no values.
     pub(crate) fn of(values: impl Iterator<Item = f64>) -> Option<Self> {
         let mut values: Vec<f64> = values.collect();
         let count = values.len();
@@ -188,7 +188,7 @@ mod tests {
         (0..count).map(at).collect()
     }
 
-    /// The truth as an estimator with a frame and a scale of its own would have it.
+    /// Returns the truth as estimated in another frame and scale.
     fn moved(truth: &[Stamped], place: &Similarity) -> Vec<Pair> {
         let back = place.rotation.inverse();
         let pair = |&truth: &Stamped| Pair {
@@ -204,7 +204,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_aligned_is_taken_away(
+        fn alignment_removes_rotation_shift_and_scale(
             turn in prop::array::uniform3(-1.0..1.0f64), shift in prop::array::uniform3(-9.0..9.0f64), scale in 0.2..5.0f64,
         ) {
             let truth = spiral(120);
@@ -227,7 +227,7 @@ mod tests {
         }
 
         #[test]
-        fn no_other_heading_is_nearer(turn in -3.0..3.0f64, off in -0.2..0.2f64, seed in 0.1..9.0f64) {
+        fn yaw_alignment_minimizes_the_position_error(turn in -3.0..3.0f64, off in -0.2..0.2f64, seed in 0.1..9.0f64) {
             let truth = spiral(60);
             let place =
                 Similarity { scale: 1.0, rotation: DQuat::from_rotation_z(turn), translation_m: DVec3::ONE };
@@ -245,8 +245,8 @@ mod tests {
     }
 
     #[test]
-    fn a_drift_is_found_over_each_metre_and_second() {
-        // 1 m/s along x, 2 % too short, and a degree a second of heading that is not there.
+    fn measures_a_drift_per_metre_and_per_second() {
+        // 1 m/s along x. The estimate is 2 % too short, and its heading drifts by 1 deg/s.
         let pair = |k: u32| {
             let t = f64::from(k) * 0.01;
             let truth = Stamped { at_s: t, position_m: DVec3::X * t, rotation: DQuat::IDENTITY };
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_cannot_be_aligned() {
+    fn rejects_alignment_of_a_straight_line() {
         let truth: Vec<Stamped> = (0..9)
             .map(|k| Stamped { position_m: DVec3::X * f64::from(k), ..spiral(1)[0] })
             .collect();

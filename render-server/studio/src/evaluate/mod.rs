@@ -1,4 +1,4 @@
-//! `vizflyt evaluate`: how far an estimated trajectory is from the true one, as `evo` measures it.
+//! `vizflyt evaluate`: errors of an estimated trajectory, computed as by `evo`.
 
 mod errors;
 mod page;
@@ -19,7 +19,7 @@ use self::pairs::Pair;
 pub use self::pairs::{Association, associate, interpolated};
 pub use self::trajectory::{Stamped, read};
 
-/// Measures how far an estimated trajectory is from the true one: absolute and relative errors.
+/// Measure the absolute and relative errors of an estimated trajectory
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt evaluate truth.tum odometry.tum --align se3
@@ -28,40 +28,40 @@ pub use self::trajectory::{Stamped, read};
   vizflyt evaluate their-capture my-capture --align sim3
 
 A trajectory is TUM's text (stamp tx ty tz qx qy qz qw), EuRoC's CSV, or a flight's log with a topic of poses
-(/pose without); or both are folders of photos with poses (COLMAP, transforms.json): photos of one name are compared, a
-second apart. The numbers are those of evo_ape and evo_rpe: docs/guides/logs.md.")]
+(default: /pose). Or both are folders of photos with poses (COLMAP, transforms.json): photos with the same name are
+compared, one second apart. The numbers match those of evo_ape and evo_rpe: docs/guides/logs.md.")]
 pub struct EvaluateArgs {
-    /// Where it was
+    /// True trajectory
     #[arg(value_name = "TRUTH")]
     truth: String,
-    /// Where it was thought to be
+    /// Estimated trajectory
     #[arg(value_name = "ESTIMATE")]
     estimate: String,
-    /// What of the estimate's frame is unknown, and found by least squares
+    /// Unknown part of the estimate's frame, found by least squares
     #[arg(long, value_enum, default_value = "none")]
     align: Alignment,
-    /// Over what relative errors are taken: of the estimate's way, or of time
+    /// Interval of relative errors: path length of the estimate, or time
     #[arg(long, value_name = "1m|1s", default_value = "1m", value_parser = delta)]
     delta: Delta,
-    /// What is taken of the trajectory with more poses at the other's instants
+    /// Association of poses at the times of the trajectory with fewer poses
     #[arg(long, value_enum, default_value = "interpolate")]
     associate: Association,
-    /// How far in time a pose of the other may be [s]
+    /// Maximum time difference of associated poses [s]
     #[arg(long, value_name = "SECONDS", default_value_t = 0.01)]
     max_diff: f64,
-    /// Prints the figures as JSON
+    /// Print the errors as JSON
     #[arg(long)]
     json: bool,
-    /// Writes a page with both ways and the drift
+    /// HTML page with both trajectories and the drift
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
 }
 
-/// Measures, and prints what was asked for.
+/// Runs `vizflyt evaluate`.
 pub fn run(args: &EvaluateArgs) -> Result<ExitCode> {
     ensure!(
         args.max_diff >= 0.0 && args.max_diff.is_finite(),
-        "--max-diff is a time of 0 s or more"
+        "--max-diff must be a time of 0 s or more"
     );
     let are_photos = [&args.truth, &args.estimate].map(|source| Path::new(source).is_dir());
     let (truth, estimate) = match are_photos {
@@ -76,8 +76,8 @@ pub fn run(args: &EvaluateArgs) -> Result<ExitCode> {
     let pairs = associate(&truth, &estimate, args.associate, args.max_diff);
     ensure!(
         !pairs.is_empty(),
-        "no two poses are within {} s of each other: {} is from {:.3} to {:.3} s, {} from {:.3} to {:.3} s; are they \
-         of one clock? --max-diff allows more",
+        "no two poses are within {} s of each other: {} is from {:.3} to {:.3} s, {} from {:.3} to {:.3} s; do they \
+         use the same clock? --max-diff allows more",
         args.max_diff,
         args.truth,
         truth[0].at_s,
@@ -99,7 +99,7 @@ pub fn run(args: &EvaluateArgs) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Reads `1m`, `0.5s`.
+/// Parses `1m`, `0.5s`.
 fn delta(text: &str) -> Result<Delta, String> {
     let wrong = || format!("'{text}' is neither metres nor seconds: 1m, 0.5s");
     let (number, of): (&str, fn(f64) -> Delta) =
@@ -116,67 +116,67 @@ fn delta(text: &str) -> Result<Delta, String> {
         .ok_or_else(wrong)
 }
 
-/// An estimate, held against the truth.
+/// Comparison of an estimate with the truth.
 pub struct Evaluation {
-    /// The estimate in the truth's frame.
+    /// Pairs with the estimate in the truth's frame.
     pairs: Vec<Pair>,
     absolute: Vec<Error>,
-    /// What it amounts to.
+    /// Summary for printing.
     pub figures: Figures,
 }
 
-/// What `--json` prints. Null is what these trajectories do not say.
+/// Output of `--json`. Values that cannot be determined from these trajectories are null.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Figures {
     align: String,
     delta: String,
-    /// Poses of both that were compared.
+    /// Number of compared pairs of poses.
     pub pairs: usize,
-    /// From the first to the last of them. [s]
+    /// Time from the first to the last pair. [s]
     seconds: f64,
-    /// The truth's way. [m]
+    /// Length of the true path. [m]
     path_m: f64,
-    /// By which the estimate was multiplied.
+    /// Factor by which the estimate was multiplied.
     scale: f64,
-    /// Absolute position error, root of the mean square. [m]
+    /// Absolute position error, root mean square. [m]
     pub ate_rmse_m: f64,
     ate_mean_m: f64,
     ate_median_m: f64,
-    /// The greatest. [m]
+    /// Maximum absolute position error. [m]
     pub ate_max_m: f64,
     ate_rot_rmse_deg: f64,
     ate_rot_max_deg: f64,
-    /// Steps of `delta` that relative errors are of.
+    /// Number of steps of `delta` for the relative errors.
     rpe_pairs: usize,
-    /// Relative position error over `delta`, root of the mean square. [m]
+    /// Relative position error over `delta`, root mean square. [m]
     pub rpe_trans_rmse_m: Option<f64>,
     rpe_trans_max_m: Option<f64>,
-    /// And of the rotation. [deg]
+    /// Relative rotation error over `delta`, root mean square. [deg]
     pub rpe_rot_rmse_deg: Option<f64>,
     rpe_rot_max_deg: Option<f64>,
-    /// The same over longer and longer ways.
+    /// Relative errors for increasing distances.
     by_distance: Vec<ByDistance>,
 }
 
-/// Relative errors over ways of one length.
+/// Relative errors over one distance.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ByDistance {
     distance_m: f64,
     steps: usize,
     trans_rmse_m: f64,
-    /// Of the distance. [%]
+    /// Position error relative to the distance. [%]
     trans_percent: f64,
     rot_rmse_deg: f64,
 }
 
-/// Ways over which the drift is shown. [m]
+/// Distances for which the drift is shown. [m]
 const DISTANCES_M: [f64; 7] = [0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
 
 impl Evaluation {
-    /// Measures at least one pair.
+    /// Computes the errors of at least one pair.
     ///
     /// # Errors
-    /// If there is none, or they cannot be aligned.
+    /// There are no pairs, or they cannot be aligned.
     pub fn of(pairs: &[Pair], alignment: Alignment, delta: Delta) -> Result<Self> {
         ensure!(!pairs.is_empty(), "no pose to compare");
         let place = errors::align(pairs, alignment)?;
@@ -255,7 +255,7 @@ impl Evaluation {
                 figures.rpe_pairs, figures.delta
             ),
             _ => format!(
-                "relative    none: the whole is shorter than {}; --delta takes a shorter one",
+                "relative    none: the trajectory is shorter than {}; give a smaller --delta",
                 figures.delta
             ),
         });

@@ -1,4 +1,4 @@
-//! The page of an evaluation: both ways from above and from the side, and the error over time. One file, no script.
+//! HTML page of an evaluation: both paths from above and from the side, and the error over time. One file, no script.
 
 use std::fmt::Write as _;
 
@@ -34,7 +34,7 @@ pub(super) fn html(truth: &str, estimate: &str, evaluation: &Evaluation) -> Stri
             false,
         ),
         chart(
-            "Attitude off",
+            "Attitude error",
             ("time [s]", "[deg]"),
             &over_time(|error| error.turn_rad.to_degrees()),
             false,
@@ -58,7 +58,7 @@ fn table(figures: &Figures) -> String {
     };
     let rows = [
         ("Poses compared", figures.pairs.to_string()),
-        ("Way, time", format!("{:.2} m, {:.1} s", figures.path_m, figures.seconds)),
+        ("Path, time", format!("{:.2} m, {:.1} s", figures.path_m, figures.seconds)),
         ("Alignment", format!("{}, scale {:.5}", figures.align, figures.scale)),
         ("Absolute error, rmse", number(Some(figures.ate_rmse_m), "m")),
         ("Absolute error, max", number(Some(figures.ate_max_m), "m")),
@@ -97,7 +97,7 @@ struct Line {
     points: Vec<(f64, f64)>,
 }
 
-/// Draws lines into one chart; `is_map`: both axes have one scale.
+/// Draws lines into one chart; with `is_map`, both axes have the same scale.
 fn chart(title: &str, (x_name, y_name): (&str, &str), lines: &[Line], is_map: bool) -> String {
     let points = || lines.iter().flat_map(|line| &line.points);
     let bounds = |values: &mut dyn Iterator<Item = f64>| {
@@ -151,7 +151,7 @@ fn chart(title: &str, (x_name, y_name): (&str, &str), lines: &[Line], is_map: bo
         TOP - 6.0
     );
     for line in lines {
-        // More points than the picture has columns show nothing more.
+        // More points than columns of the image add no detail.
         let every = line.points.len().div_ceil(3000).max(1);
         let path: Vec<String> = line
             .points
@@ -165,7 +165,7 @@ fn chart(title: &str, (x_name, y_name): (&str, &str), lines: &[Line], is_map: bo
     svg + "</svg></figure>\n"
 }
 
-/// Round values within, some five of them.
+/// Returns about five round values within the range.
 fn ticks((low, high): (f64, f64)) -> Vec<f64> {
     let rough = (high - low) / 5.0;
     let power = 10f64.powf(rough.log10().floor());
@@ -180,7 +180,7 @@ fn ticks((low, high): (f64, f64)) -> Vec<f64> {
 }
 
 fn label(value: f64) -> String {
-    // Without the dust of multiplying.
+    // Removes rounding errors.
     let rounded = (value * 1e6).round() / 1e6;
     format!("{}", rounded + 0.0)
 }

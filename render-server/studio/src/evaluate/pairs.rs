@@ -1,27 +1,27 @@
-//! Which pose of the estimate is held against which of the truth.
+//! Association of estimated with true poses.
 //!
-//! As `evo` has it: of the trajectory with fewer poses each is looked for in the other, where one must be within
-//! `max_diff_s`; then the other is interpolated there, or its nearest pose is taken.
+//! Same method as `evo`: for each pose of the trajectory with fewer poses, the other one must have a pose within
+//! `max_diff_s`. The other one is then interpolated, or its nearest pose is used.
 
 use super::trajectory::Stamped;
 
-/// What is taken of the trajectory with more poses.
+/// Association of poses, applied to the trajectory with more poses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Association {
-    /// Positions between two poses on the line, rotations on the arc
+    /// Interpolate between two poses: positions linearly, rotations on the arc
     Interpolate,
-    /// The pose nearest in time
+    /// Use the pose nearest in time
     Nearest,
 }
 
-/// A pose of the truth and one of the estimate, of the same instant.
+/// A true and an estimated pose of the same instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pair {
     pub truth: Stamped,
     pub estimate: Stamped,
 }
 
-/// Returns the pairs, ascending in time. Both trajectories ascend.
+/// Returns the pairs in order of time. Both trajectories must be in order of time.
 pub fn associate(
     truth: &[Stamped],
     estimate: &[Stamped],
@@ -48,7 +48,7 @@ pub fn associate(
     sparse.iter().filter_map(pair).collect()
 }
 
-/// The first pose that is not before `at_s`, so that there is one before it: its place; 1 at least.
+/// Returns the index of the first pose at or after `at_s`; at least 1, so that there is a pose before it.
 fn after(poses: &[Stamped], at_s: f64) -> usize {
     poses.partition_point(|pose| pose.at_s < at_s).clamp(1, poses.len().max(2) - 1)
 }
@@ -62,7 +62,7 @@ fn nearest(poses: &[Stamped], at_s: f64) -> Option<Stamped> {
     Some(*only)
 }
 
-/// Returns the pose of an instant; beyond the ends the first or last one stays.
+/// Returns the pose at an instant; before the first or after the last pose, that pose.
 pub fn interpolated(poses: &[Stamped], at_s: f64) -> Stamped {
     let [only] = poses else {
         let next = after(poses, at_s);
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn between_two_poses_it_is_on_the_line() {
+    fn interpolates_between_two_poses() {
         let truth = line((0..100).map(|k| f64::from(k) * 0.01));
         let estimate = line([-1.0, 0.004, 0.5049, 0.993, 2.0]);
         let pairs = associate(&truth, &estimate, Association::Interpolate, 0.01);
@@ -102,14 +102,14 @@ mod tests {
             assert!((pair.truth.position_m - pair.estimate.position_m).length() < 1e-12);
             assert!(pair.truth.rotation.angle_between(pair.estimate.rotation) < 1e-7);
         }
-        // Beyond its end it stays.
+        // Beyond the end, the last pose is used.
         assert!((pairs[2].truth.position_m.x - 0.99).abs() < 1e-12);
         let nearest = associate(&truth, &estimate, Association::Nearest, 0.01);
         assert!((nearest[1].truth.position_m.x - 0.5).abs() < 1e-12);
     }
 
     #[test]
-    fn a_single_pose_and_none_are_no_panic() {
+    fn handles_a_single_pose_and_no_poses() {
         let one = line([0.5]);
         assert_eq!(associate(&one, &line([0.501]), Association::Interpolate, 0.01).len(), 1);
         assert_eq!(associate(&one, &[], Association::Interpolate, 0.01), []);

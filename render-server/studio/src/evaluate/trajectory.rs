@@ -1,4 +1,4 @@
-//! A trajectory: poses and their instants, from a file or from a topic of a flight's log.
+//! Trajectories: poses with times, from a file or from a topic of a flight log.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -9,21 +9,21 @@ use vizflyt_protocol::geometry::{Cam, Pose, World};
 use vizflyt_runtime::log::read::{LogReader, RecordedPoses};
 use vizflyt_twin::dataset;
 
-/// Where something was at an instant.
+/// Pose at an instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Stamped {
     /// [s]
     pub at_s: f64,
     /// [m]
     pub position_m: DVec3,
-    /// Its axes to those of the frame that the trajectory is in.
+    /// Rotation from the body's axes to the trajectory's frame.
     pub rotation: DQuat,
 }
 
-/// Reads a trajectory, ascending in time: TUM's text, EuRoC's CSV, or `FLIGHT.mcap#TOPIC` (`/pose` without).
+/// Reads a trajectory in order of time: TUM text, EuRoC CSV, or `FLIGHT.mcap#TOPIC` (default topic: `/pose`).
 ///
 /// # Errors
-/// What is wrong with the file, with its line.
+/// The file is invalid; the message includes the line.
 pub fn read(source: &str) -> Result<Vec<Stamped>> {
     let topic_at = [".mcap#", ".mcap:"].iter().find_map(|mark| source.split_once(mark));
     let (path, topic) = match topic_at {
@@ -38,7 +38,7 @@ pub fn read(source: &str) -> Result<Vec<Stamped>> {
     let size = std::fs::metadata(path).with_context(context)?.len();
     ensure!(
         size <= LARGEST,
-        "{source} has {} MB, more than a trajectory of {} MB",
+        "{source} has {} MB; the maximum of a trajectory is {} MB",
         size >> 20,
         LARGEST >> 20
     );
@@ -46,14 +46,14 @@ pub fn read(source: &str) -> Result<Vec<Stamped>> {
     parse(&String::from_utf8_lossy(&text)).with_context(context)
 }
 
-/// Reads where the photos of two datasets were taken from: those of one name, in its order, a second apart.
+/// Reads the camera poses of the photos that two datasets have in common, in order of their names, one second apart.
 ///
 /// # Errors
-/// A folder that is no dataset, or two without a photo in common.
+/// A folder is not a dataset, or the two have no photo in common.
 pub fn of_photos(truth: &str, estimate: &str) -> Result<(Vec<Stamped>, Vec<Stamped>)> {
     let read = |folder: &str| -> Result<BTreeMap<String, _>> {
         let poses = dataset::read_poses(Path::new(folder))?;
-        // Folders differ from program to program.
+        // The folder part of the names differs between programs.
         let file = |name: &str| name.rsplit('/').next().unwrap_or(name).to_owned();
         Ok(poses.into_iter().map(|(name, pose)| (file(&name), pose)).collect())
     };
@@ -94,12 +94,12 @@ fn of_log(path: &Path, topic: &str) -> Result<Vec<Stamped>> {
     Ok(found)
 }
 
-/// Reads TUM's text (`stamp_s tx ty tz qx qy qz qw`, blanks between) or EuRoC's CSV (`stamp_ns,x,y,z,qw,qx,qy,qz,...`).
+/// Reads TUM text (`stamp_s tx ty tz qx qy qz qw`, with spaces) or EuRoC CSV (`stamp_ns,x,y,z,qw,qx,qy,qz,...`).
 fn parse(text: &str) -> Result<Vec<Stamped>> {
     let mut found: Vec<Stamped> = Vec::new();
     for (k, row) in text.trim_start_matches('\u{feff}').lines().enumerate() {
         let (line, row) = (k + 1, row.trim());
-        // EuRoC's header begins with # as comments do; others' with a word.
+        // EuRoC's header begins with #, like comments; other headers begin with a word.
         if row.is_empty()
             || row.starts_with('#')
             || found.is_empty() && row.starts_with(char::is_alphabetic)
@@ -114,14 +114,14 @@ fn parse(text: &str) -> Result<Vec<Stamped>> {
                     pose.at_s
                 )
             }
-            // The same instant again: the first counts.
+            // Of several poses with the same stamp, the first is used.
             Some(last_s) if pose.at_s == last_s => {}
             _ => found.push(pose),
         }
     }
     ensure!(
         !found.is_empty(),
-        "no pose is in it; lines of `stamp tx ty tz qx qy qz qw` are wanted"
+        "it contains no pose; expected lines of `stamp tx ty tz qx qy qz qw`"
     );
     Ok(found)
 }
@@ -133,11 +133,11 @@ fn pose(row: &str) -> Result<Stamped> {
     } else {
         row.split_whitespace().collect()
     };
-    // EuRoC's have velocity and biases behind the pose.
+    // EuRoC files have velocity and biases after the pose.
     let fits = if is_csv { cells.len() >= 8 } else { cells.len() == 8 };
     ensure!(
         fits,
-        "{} numbers, where 8 are wanted: stamp tx ty tz qx qy qz qw, or EuRoC's CSV",
+        "{} numbers instead of 8: stamp tx ty tz qx qy qz qw, or EuRoC's CSV",
         cells.len()
     );
     let mut numbers = [0.0; 8];
@@ -146,7 +146,7 @@ fn pose(row: &str) -> Result<Stamped> {
             .parse()
             .ok()
             .filter(|value: &f64| value.is_finite())
-            .with_context(|| format!("'{cell}' is no number"))?;
+            .with_context(|| format!("'{cell}' is not a finite number"))?;
     }
     let [stamp, x, y, z, a, b, c, d] = numbers;
     let (at_s, rotation) = if is_csv {
@@ -157,12 +157,12 @@ fn pose(row: &str) -> Result<Stamped> {
     let length = rotation.length();
     ensure!(
         (0.9..1.1).contains(&length),
-        "the quaternion's length is {length:.3}, which is no rotation"
+        "the quaternion has length {length:.3}; a rotation has length 1"
     );
     let position_m = DVec3::new(x, y, z);
     ensure!(
         position_m.abs().max_element() <= FARTHEST_M,
-        "{position_m:.0} m is nowhere; are these metres?"
+        "position {position_m:.0} m is out of range; are these metres?"
     );
     Ok(Stamped { at_s, position_m, rotation: rotation.normalize() })
 }
@@ -171,7 +171,7 @@ fn shortened(row: &str) -> String {
     row.chars().take(60).collect()
 }
 
-/// Hours at 1 kHz. [bytes]
+/// Maximum file size: hours at 1 kHz. [bytes]
 const LARGEST: u64 = 1 << 30;
 const FARTHEST_M: f64 = 1e7;
 
@@ -192,13 +192,13 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_told_by_its_line() {
+    fn errors_state_the_problem_and_its_line() {
         for (text, told) in [
             ("", "no pose"),
             ("1 2 3\n", "3 numbers"),
             ("0 0 0 0 0 0 0 1\n1 0 0 x 0 0 0 1\n", "line 2"),
-            ("0 0 0 0 0 0 0 0\n", "no rotation"),
-            ("0 0 0 0 0 0 0 nan\n", "no number"),
+            ("0 0 0 0 0 0 0 0\n", "length 0.000"),
+            ("0 0 0 0 0 0 0 nan\n", "not a finite number"),
             ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "time goes back"),
             ("1 0 0 1e9 0 0 0 1\n", "metres"),
         ] {
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn photos_of_one_name_are_compared() {
+    fn compares_photos_with_the_same_name() {
         let folder = tempfile::tempdir().unwrap();
         let write = |name: &str, frames: &[(&str, f64)]| {
             let path = folder.path().join(name);
@@ -239,7 +239,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_text_is_read_or_refused(text in "[0-9eE+.,# \\-\na-c]{0,200}") {
+        fn any_text_is_parsed_to_valid_poses_or_rejected(text in "[0-9eE+.,# \\-\na-c]{0,200}") {
             if let Ok(poses) = parse(&text) {
                 prop_assert!(poses.is_sorted_by(|a, b| a.at_s < b.at_s));
                 prop_assert!(poses.iter().all(|pose| pose.rotation.is_normalized()));

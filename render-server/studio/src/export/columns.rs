@@ -1,4 +1,4 @@
-//! A table of named columns, as CSV; `parquet` writes the same.
+//! Table of named columns, and its CSV form; `parquet` writes the same table.
 
 use std::fmt::Write;
 
@@ -8,35 +8,33 @@ use glam::{DQuat, DVec3};
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Values {
     Integers(Vec<i64>),
-    /// NaN is not known.
+    /// NaN: unknown.
     Numbers(Vec<f64>),
     Texts(Vec<String>),
 }
 
-/// Columns of one length.
+/// Columns of equal length.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Table {
     pub(super) columns: Vec<(String, Values)>,
 }
 
 impl Table {
-    /// Adds a column of whole numbers, times say. What is beyond 63 bits is the greatest.
+    /// Adds a column of integers, for example times. Values beyond 63 bits saturate.
     pub(super) fn integers(&mut self, name: &str, values: impl Iterator<Item = u64>) {
         let values = values.map(|value| i64::try_from(value).unwrap_or(i64::MAX)).collect();
         self.columns.push((name.to_owned(), Values::Integers(values)));
     }
 
-    /// Adds a column of numbers.
     pub(super) fn numbers(&mut self, name: &str, values: impl Iterator<Item = f64>) {
         self.columns.push((name.to_owned(), Values::Numbers(values.collect())));
     }
 
-    /// Adds a column of texts.
     pub(super) fn texts(&mut self, name: &str, values: impl Iterator<Item = String>) {
         self.columns.push((name.to_owned(), Values::Texts(values.collect())));
     }
 
-    /// Adds `NAME_x` to `NAME_z`; what is not known is NaN.
+    /// Adds `NAME_x` to `NAME_z`; unknown values are NaN.
     #[allow(clippy::needless_pass_by_value)] // Why: an iterator, walked once for each axis.
     pub(super) fn vectors(
         &mut self,
@@ -49,7 +47,7 @@ impl Table {
         }
     }
 
-    /// Adds `NAME_qx` to `NAME_qw`; what is not known is NaN.
+    /// Adds `NAME_qx` to `NAME_qw`; unknown values are NaN.
     #[allow(clippy::needless_pass_by_value)] // Why: an iterator, walked once for each axis.
     pub(super) fn rotations(
         &mut self,
@@ -73,7 +71,7 @@ impl Table {
         })
     }
 
-    /// Returns it as CSV (RFC 4180): names first; what is not known is empty.
+    /// Returns the table as CSV (RFC 4180) with a header; unknown values are empty.
     pub(super) fn to_csv(&self) -> String {
         let names: Vec<&str> = self.columns.iter().map(|(name, _)| name.as_str()).collect();
         let mut text = names.join(",") + "\n";
@@ -103,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn csv_quotes_what_needs_it_and_leaves_out_what_is_not_known() {
+    fn csv_quotes_special_characters_and_omits_unknown_values() {
         let mut table = Table::default();
         table.integers("at_ns", [1, u64::MAX].into_iter());
         table.vectors("p", [Some(DVec3::new(0.5, -1.0, 2.0)), None].into_iter());

@@ -1,8 +1,8 @@
-//! EuRoC's layout (M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016): `mav0/cam0/data/NS.png`, `imu0`,
-//! `state_groundtruth_estimate0`, each with its `data.csv` and `sensor.yaml`.
+//! EuRoC's layout (M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016): `mav0/cam0/data/NS.png`,
+//! `imu0`, `state_groundtruth_estimate0`, each with its `data.csv` and `sensor.yaml`.
 //!
-//! Its body frame is ours (x forward, y left, z up), and the IMU is in it. Depth, which EuRoC has not, lies in
-//! `mav0/depth0` as 16-bit PNG of millimetres.
+//! Its body frame is that of VizFlyt (x forward, y left, z up), with the IMU at its origin. EuRoC defines no depth; it
+//! is written to `mav0/depth0` as 16-bit PNG in millimetres.
 
 use std::fmt::Write;
 
@@ -16,7 +16,7 @@ use super::pictures::Pictures;
 use super::table::{Row, write_beside};
 use super::{Written, write_text};
 
-/// A camera's files.
+/// Files of a camera.
 struct Sensor {
     camera: String,
     intrinsics: Intrinsics,
@@ -25,7 +25,7 @@ struct Sensor {
     depths: Vec<u64>,
 }
 
-/// Writes it.
+/// Writes the data set.
 pub(super) fn write(
     folder: &Folder,
     motion: &FlightTracks,
@@ -78,7 +78,7 @@ fn camera(folder: &Folder, path: &str, sensor: &Sensor, stamps: &[u64]) -> Resul
     write_text(&folder.at(&format!("{path}/sensor.yaml"))?, &text)
 }
 
-/// Returns a camera's list of images, named by their instants.
+/// Returns the list of a camera's images, which are named by their times.
 pub(crate) fn images_csv(stamps: &[u64], ending: &str) -> String {
     let mut text = "#timestamp [ns],filename\n".to_owned();
     for at_ns in stamps {
@@ -102,7 +102,7 @@ pub(crate) fn camera_yaml(
         }
         Distortion::KannalaBrandt { .. } => ("equidistant", k.distortion.to_wire().1[..4].to_vec()),
     };
-    // OpenCV's: the centre of the first pixel is 0.
+    // OpenCV's convention: the centre of the first pixel is 0.
     let intrinsics = [k.fx_px, k.fy_px, k.cx_px - 0.5, k.cy_px - 0.5];
     format!(
         "sensor_type: camera\ncomment: {comment}\n{}rate_hz: {:.3}\nresolution: [{}, {}]\ncamera_model: pinhole\n\
@@ -115,7 +115,7 @@ pub(crate) fn camera_yaml(
     )
 }
 
-/// Returns a sensor's place in the body as its file has it.
+/// Returns the pose of a sensor in the body as YAML.
 pub(super) fn transform<A: Frame>(body_from_sensor: &Pose<Body, A>) -> String {
     let p = body_from_sensor.translation_m;
     let axes = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| body_from_sensor.rotate(axis));
@@ -129,7 +129,7 @@ pub(super) fn transform<A: Frame>(body_from_sensor: &Pose<Body, A>) -> String {
     )
 }
 
-/// Returns how many readings there are a second, from the first to the last.
+/// Returns the mean rate of readings from the first to the last. [Hz]
 pub(super) fn rate_hz(stamps: &[u64]) -> f64 {
     let seconds = stamps
         .last()
@@ -149,7 +149,7 @@ fn imu(folder: &Folder, motion: &FlightTracks) -> Result<()> {
     write_text(&folder.at("mav0/imu0/data.csv")?, &text)?;
     let stamps: Vec<u64> = motion.imu.iter().map(|reading| reading.at_ns).collect();
     let text = format!(
-        "sensor_type: imu\ncomment: the autopilot's\n{}rate_hz: {:.3}\n",
+        "sensor_type: imu\ncomment: IMU of the autopilot\n{}rate_hz: {:.3}\n",
         transform::<Body>(&Pose::IDENTITY),
         rate_hz(&stamps)
     );
@@ -164,11 +164,11 @@ fn truth(folder: &Folder, motion: &FlightTracks) -> Result<()> {
     });
     let path = "mav0/state_groundtruth_estimate0";
     write_text(&folder.at(&format!("{path}/data.csv"))?, &truth_csv(rows))?;
-    let text = truth_yaml("the localized pose of the body in the world");
+    let text = truth_yaml("localized pose of the body in the world");
     write_text(&folder.at(&format!("{path}/sensor.yaml"))?, &text)
 }
 
-/// The true motion of the body at an instant.
+/// True motion of the body at an instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct TruthRow {
     pub(crate) at_ns: u64,
@@ -176,7 +176,7 @@ pub(crate) struct TruthRow {
     pub(crate) v_world_mps: DVec3,
 }
 
-/// Returns the list of true motions. Biases are not known, and written as 0.
+/// Returns the list of true motions as CSV. Biases are unknown and written as 0.
 pub(crate) fn truth_csv(rows: impl Iterator<Item = TruthRow>) -> String {
     let mut text = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], \
                     v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], \
@@ -194,7 +194,7 @@ pub(crate) fn truth_csv(rows: impl Iterator<Item = TruthRow>) -> String {
     text
 }
 
-/// Returns the `sensor.yaml` of the list of true motions.
+/// Returns the `sensor.yaml` for the list of true motions.
 pub(crate) fn truth_yaml(comment: &str) -> String {
     format!(
         "sensor_type: visual-inertial\ncomment: {comment}\n{}",

@@ -1,4 +1,4 @@
-//! The folder of a data set: under another name until it is whole, so that what is there is whole.
+//! Output folder of a data set. It has a temporary name until it is complete.
 
 use std::fs;
 use std::io::BufWriter;
@@ -8,40 +8,40 @@ use anyhow::{Context, Result, ensure};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 
-/// A folder that is being written.
+/// Folder that is being written.
 #[derive(Debug)]
 pub(super) struct Folder {
-    /// Its name once it is whole.
+    /// Final path.
     target: PathBuf,
     part: PathBuf,
 }
 
 impl Folder {
-    /// Begins a folder that will be called `target`.
+    /// Creates the temporary folder for `target`.
     ///
     /// # Errors
-    /// If something is there, or an interrupted export is.
+    /// The target or its temporary folder exists.
     pub(super) fn begin(target: &Path) -> Result<Self> {
         ensure!(
             !target.exists(),
-            "{} is there already; nothing is overwritten: give another folder, or delete it",
+            "{} already exists; nothing is overwritten: give another folder, or delete it",
             target.display()
         );
         let name =
-            target.file_name().with_context(|| format!("{} names no folder", target.display()))?;
+            target.file_name().with_context(|| format!("{} is not the name of a folder", target.display()))?;
         let mut part = name.to_owned();
         part.push(".part");
         let part = target.with_file_name(part);
         ensure!(
             !part.exists(),
-            "{} is there: an export that was interrupted, or is under way; delete it to begin again",
+            "{} exists: an interrupted or running export; delete it to start again",
             part.display()
         );
         fs::create_dir_all(&part).with_context(|| format!("cannot make {}", part.display()))?;
         Ok(Self { target: target.to_owned(), part })
     }
 
-    /// Returns where a file of it is written, and makes the folders above.
+    /// Returns the temporary path of a file, and creates its parent folders.
     pub(super) fn at(&self, path: &str) -> Result<PathBuf> {
         let path = self.part.join(path);
         if let Some(above) = path.parent() {
@@ -51,7 +51,7 @@ impl Folder {
         Ok(path)
     }
 
-    /// Gives it its name.
+    /// Renames the folder to its final path.
     pub(super) fn finish(&self) -> Result<()> {
         fs::rename(&self.part, &self.target).with_context(|| {
             format!("cannot rename {} to {}", self.part.display(), self.target.display())
@@ -61,17 +61,18 @@ impl Folder {
 
 impl Drop for Folder {
     fn drop(&mut self) {
-        // Whatever ended it: half a data set is none. It is gone where it was finished.
+        // Removes an incomplete data set. After `finish`, the temporary folder no longer exists.
         let _ = fs::remove_dir_all(&self.part);
     }
 }
 
-/// Writes an image of 8 bits a channel as PNG, H x W x 3, sRGB.
+/// Writes an image of H x W x 3 bytes, sRGB, as PNG.
 pub(super) fn write_rgb(path: &Path, rgb: &[u8], (width, height): (u32, u32)) -> Result<()> {
     write_png(path, rgb, (width, height), ExtendedColorType::Rgb8)
 }
 
-/// Writes depth as 16-bit PNG, so many units a metre; what is beyond its range is 0, no return. Millimetres in.
+/// Writes depth in millimetres as 16-bit PNG with this number of units per millimetre. Depth beyond its range becomes 0
+/// (no depth).
 pub(super) fn write_depth(
     path: &Path,
     depth_mm: &[u16],
@@ -83,7 +84,7 @@ pub(super) fn write_depth(
     write_png(path, &bytes, size, ExtendedColorType::L16)
 }
 
-/// `image` takes 16-bit samples in this computer's order.
+/// Writes a PNG. `image` expects 16-bit samples in native byte order.
 fn write_png(
     path: &Path,
     bytes: &[u8],
@@ -102,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_is_there_when_it_is_whole() {
+    fn the_folder_appears_when_it_is_complete() {
         let above = tempfile::tempdir().unwrap();
         let target = above.path().join("set");
         let folder = Folder::begin(&target).unwrap();
@@ -119,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn depth_beyond_the_range_of_its_png_is_no_return() {
+    fn depth_beyond_the_range_of_the_png_becomes_zero() {
         let above = tempfile::tempdir().unwrap();
         let path = above.path().join("depth.png");
         write_depth(&path, &[0, 1000, 13_107, 13_108, 65_535, 7], (3, 2), 5).unwrap();

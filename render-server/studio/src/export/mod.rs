@@ -1,11 +1,11 @@
-//! `vizflyt export`: a flight's log as a data set that other people's programs read.
+//! `vizflyt export`: exports a flight's log as a data set for other programs.
 //!
 //! ```text
-//! log, without images -> Motion    poses, sigmas, IMU, setpoints, odometry: all in memory
-//! log, with images    -> Pictures  one after the other, decoded -> euroc | tum -> folder
-//! log, with images    -> sensors   readings of what is no camera
+//! log, without images -> FlightTracks  poses, sigmas, IMU, setpoints, odometry: all in memory
+//! log, with images    -> Pictures      decoded one after the other -> euroc | tum | table -> folder
+//! log, with images    -> sensors       readings of sensors that are not cameras
 //! ```
-//! Every image is named by the instant that it shows. The folder appears under its name when it is whole.
+//! Each image is named by the time that it shows. The folder gets its name when it is complete.
 
 mod columns;
 pub(crate) mod euroc;
@@ -28,41 +28,41 @@ use self::files::Folder;
 use self::motion::FlightTracks;
 use self::pictures::Pictures;
 
-/// Writes a flight's log as a data set: EuRoC, TUM RGB-D, or tables.
+/// Export a flight's log as a data set: EuRoC, TUM RGB-D, or tables
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt export flight.mcap --format euroc -o flight       mav0/cam0/data/NS.png, imu0, state_groundtruth_estimate0
   vizflyt export flight.mcap --format tum -o flight         rgb/, depth/ (5000 per metre), groundtruth.txt of the camera
   vizflyt export flight.mcap --format parquet -o flight     tables: poses, imu, images, setpoints; images as PNG
 
-An image's name is the instant that it shows. Which images there are is up to --log of the flight; what each file holds
-is in docs/guides/logs.md.")]
+The name of an image is the time that it shows. The option --log of the flight determines which images are recorded.
+docs/guides/logs.md describes all files.")]
 pub struct ExportArgs {
-    /// The flight's log
+    /// Log of the flight
     #[arg(value_name = "FLIGHT.mcap")]
     log: PathBuf,
-    /// Whose layout
+    /// Layout of the data set
     #[arg(long, value_enum)]
     format: Format,
-    /// A folder that is not there yet
+    /// Output folder, which must not exist
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// The camera of a TUM data set, which has one [default: the first]
+    /// Camera of a TUM data set [default: the first]
     #[arg(long, value_name = "NAME")]
     camera: Option<String>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Format {
-    /// Of the micro aerial vehicle data sets of ETH Zurich: all cameras, IMU, truth of the body
+    /// EuRoC (ETH Zurich): all cameras, IMU, ground truth of the body
     Euroc,
-    /// Of the RGB-D benchmark of TU Munich: one camera, depth, truth of the camera
+    /// TUM RGB-D (TU Munich): one camera, depth, ground truth of the camera
     Tum,
-    /// Tables that pandas reads, and images as PNG
+    /// Tables for pandas, and images as PNG
     Parquet,
 }
 
-/// Exports, and prints what was written.
+/// Runs `vizflyt export`.
 pub fn run(args: &ExportArgs) -> Result<ExitCode> {
     let motion = FlightTracks::read(&args.log)?;
     let folder = Folder::begin(&args.output)?;
@@ -73,7 +73,7 @@ pub fn run(args: &ExportArgs) -> Result<ExitCode> {
     );
     ensure!(
         args.camera.is_none() || args.format == Format::Tum,
-        "--camera is of --format tum; the others have all cameras"
+        "--camera is for --format tum; the other formats have all cameras"
     );
     let pictures = Pictures::open(&args.log)?;
     let written = match args.format {
@@ -94,11 +94,11 @@ pub fn run(args: &ExportArgs) -> Result<ExitCode> {
     };
     print_line(format!("images      {}{reduced}", written.images));
     if written.broken > 0 {
-        print_line(format!("broken      {} images do not decode and are left out", written.broken));
+        print_line(format!("broken      {} images do not decode and are skipped", written.broken));
     }
     print_line(format!("poses       {} ({:.1} s)", motion.poses.len(), motion.seconds()));
     print_line(format!(
-        "imu         {}, setpoints {} asked, {} sent, odometry {}",
+        "imu         {}, setpoints {} requested, {} sent, odometry {}",
         motion.imu.len(),
         motion.asked.len(),
         motion.sent.len(),
@@ -108,49 +108,48 @@ pub fn run(args: &ExportArgs) -> Result<ExitCode> {
         print_line(format!("sensors     {readings} readings, in {above}NAME"));
     }
     if motion.is_cut {
-        print_line("note        the log ends early: its flight was killed, or the file is damaged");
+        print_line("note        the log is incomplete: its flight was killed, or the file is damaged");
     }
     print_line(format!("folder      {}", args.output.display()));
     Ok(ExitCode::SUCCESS)
 }
 
-/// What was written.
+/// Counts of written images.
 #[derive(Clone, Copy, Debug, Default)]
 struct Written {
     images: usize,
-    /// Images that do not decode.
+    /// Number of images that do not decode.
     broken: usize,
 }
 
-/// Returns why there is nothing to export, and what to do.
+/// Returns the error for a log without images, with advice.
 fn without_images(log: &Path, observations: usize, foreign: Option<u32>) -> String {
     let name = log.display();
     if let Some(protocol) = foreign {
         return format!(
-            "{name} is of protocol {protocol}, whose images are not known here; export it with the version that flew it"
+            "{name} has protocol {protocol}, whose images this version cannot read; export it with the version that recorded it"
         );
     }
     match observations {
-        0 => format!("{name} holds no observation: no plugin was shown an image in that flight"),
+        0 => format!("{name} contains no observation: no plugin received an image in that flight"),
         _ => format!(
-            "{name} holds the heads of {observations} observations and no image; fly with --log full, or --log reduced \
-             and room on the disk"
+            "{name} contains {observations} observations without images; fly with --log full, or --log reduced \
+             and enough space on the disk"
         ),
     }
 }
 
-/// Reads a file's name for messages.
+/// Returns the context of a write error.
 fn context(path: &Path) -> impl Fn() -> String {
     let name = path.display().to_string();
     move || format!("cannot write {name}")
 }
 
-/// Returns an instant as TUM's text has it. [s]
+/// Returns a time as text in TUM's format. [s]
 fn seconds_text(at_ns: u64) -> String {
     format!("{}.{:09}", at_ns / 1_000_000_000, at_ns % 1_000_000_000)
 }
 
-/// Writes a file's text.
 fn write_text(path: &Path, text: &str) -> Result<()> {
     std::fs::write(path, text).with_context(context(path))
 }

@@ -1,4 +1,4 @@
-//! All of a flight but its pixels: read first, as images are to have poses of their instants.
+//! Tracks of a flight: all data except pixels. They are read first, because images need the poses of their times.
 
 use std::path::Path;
 
@@ -8,34 +8,34 @@ use vizflyt_protocol::geometry::{Body, Odom, Pose, World};
 use vizflyt_runtime::log::data::{FlightData, FlightDatum, FlightImu, FlightMotion, StampedPose};
 use vizflyt_runtime::log::read::LogReader;
 
-/// Poses farther apart than this are not interpolated between: nobody knows where it was. [ns]
+/// Maximum time between two poses for interpolation. [ns]
 const LONGEST_GAP_NS: u64 = 200_000_000;
 
-/// What a flight holds beside its pixels. All ascend in time.
+/// Tracks of a flight, in order of time.
 #[derive(Debug, Default)]
 pub(super) struct FlightTracks {
     pub(super) poses: Vec<StampedPose<World>>,
     pub(super) motions: Vec<FlightMotion>,
     pub(super) imu: Vec<FlightImu>,
     pub(super) odometry: Vec<StampedPose<Odom>>,
-    /// As JSON.
+    /// Requested setpoints, as JSON.
     pub(super) asked: Vec<(u64, Vec<u8>)>,
     pub(super) sent: Vec<(u64, Vec<u8>)>,
-    /// Images that there are.
+    /// Number of images.
     pub(super) images: usize,
-    /// Observations with their images, and all.
+    /// Number of observations with images, and of all observations.
     pub(super) with_images: usize,
     pub(super) observations: usize,
-    /// A protocol whose images are not known here.
+    /// Protocol of the log, if this version cannot read its images.
     pub(super) foreign_protocol: Option<u32>,
     pub(super) is_cut: bool,
 }
 
-/// Where the vehicle was at an instant, by the filter.
+/// Pose of the vehicle at an instant, from the filter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Interpolated {
     pub(super) world_from_body: Pose<World, Body>,
-    /// One standard deviation an axis; 0 is not known. [m, world], [rad, body]
+    /// Standard deviation of each axis; 0: unknown. [m, world], [rad, body]
     pub(super) position_sigma_m: DVec3,
     pub(super) rotation_sigma_rad: DVec3,
 }
@@ -51,7 +51,7 @@ impl FlightTracks {
             match datum {
                 FlightDatum::Image(image) => {
                     motion.images += 1;
-                    // One observation may have an image of each camera.
+                    // An observation can have an image of each camera.
                     if seq.replace(image.seq) != Some(image.seq) {
                         motion.with_images += 1;
                         motion.observations += 1;
@@ -59,7 +59,7 @@ impl FlightTracks {
                 }
                 FlightDatum::LeftOut => motion.observations += 1,
                 FlightDatum::Foreign { protocol } => motion.foreign_protocol = Some(protocol),
-                // In a pass of their own: a LiDAR's are larger than images.
+                // Read in a separate pass, because readings of a LiDAR are larger than images.
                 FlightDatum::Reading(_) => {}
                 FlightDatum::Pose(pose) => motion.poses.push(pose),
                 FlightDatum::Motion(one) => motion.motions.push(one),
@@ -70,7 +70,7 @@ impl FlightTracks {
             }
         }
         motion.is_cut = data.is_cut();
-        // Two threads write: a log is in order but for what they overtake.
+        // Two threads write the log, so entries can be slightly out of order.
         ascending(&mut motion.poses, |pose| pose.at_ns);
         ascending(&mut motion.motions, |one| one.at_ns);
         ascending(&mut motion.imu, |reading| reading.at_ns);
@@ -80,14 +80,13 @@ impl FlightTracks {
         Ok(motion)
     }
 
-    /// From the first pose to the last. [s]
+    /// Returns the time from the first to the last pose. [s]
     pub(super) fn seconds(&self) -> f64 {
         let ends = self.poses.first().zip(self.poses.last());
         ends.map_or(0.0, |(first, last)| (last.at_ns - first.at_ns) as f64 * 1e-9)
     }
 
-    /// Returns where the vehicle was at an instant, between two poses of the filter; `None` outside of them, and in a
-    /// gap.
+    /// Returns the pose at an instant, interpolated between poses of the filter; `None` outside of them and in gaps.
     pub(super) fn at(&self, at_ns: u64) -> Option<Interpolated> {
         let next = self.poses.partition_point(|pose| pose.at_ns < at_ns);
         let b = self.poses.get(next)?;
@@ -105,7 +104,7 @@ impl FlightTracks {
         })
     }
 
-    /// Returns what is known of the motion at a pose's instant; zeros if nothing is.
+    /// Returns velocity and sigmas at the time of a pose; zeros if they are unknown.
     pub(super) fn motion_at(&self, at_ns: u64) -> FlightMotion {
         let found = self.motions.binary_search_by_key(&at_ns, |one| one.at_ns);
         found.map_or(FlightMotion { at_ns, ..FlightMotion::default() }, |index| self.motions[index])
@@ -124,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn between_two_poses_it_is_on_the_arc_and_in_a_gap_nowhere() {
+    fn interpolates_poses_but_not_across_gaps() {
         let pose = |at_ns: u64| StampedPose {
             at_ns,
             from_body: Pose::new(

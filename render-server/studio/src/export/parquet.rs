@@ -1,15 +1,15 @@
-//! Tables as Parquet files: one row group, each column one page, plain and uncompressed.
+//! Tables as Parquet files: one row group, one page per column, plain and uncompressed.
 //!
-//! After the format's specification (github.com/apache/parquet-format: README, Encodings.md "PLAIN", parquet.thrift) and that
-//! of Thrift's compact protocol. Written here, as the crates that write Parquet bring some sixty others along, and a
-//! flight's tables need three types and no option.
+//! Follows the specification of the format (github.com/apache/parquet-format: README, Encodings.md "PLAIN",
+//! parquet.thrift) and of Thrift's compact protocol. Implemented here because crates that write Parquet have about
+//! sixty dependencies, and the tables of a flight only need three types.
 
 use super::columns::{Table, Values};
 
-/// Begins and ends a file.
+/// Marker at the beginning and the end of a file.
 const MAGIC: &[u8] = b"PAR1";
 
-/// Returns a table as a file.
+/// Returns the bytes of the file of a table.
 pub(super) fn encode(table: &Table) -> Vec<u8> {
     let mut file = MAGIC.to_vec();
     let mut chunks = Vec::new();
@@ -28,7 +28,7 @@ pub(super) fn encode(table: &Table) -> Vec<u8> {
     file
 }
 
-/// Returns values one after the other, little-endian; texts with their length before.
+/// Returns values in PLAIN encoding: little-endian, texts prefixed with their length.
 fn plain(values: &Values) -> Vec<u8> {
     match values {
         Values::Integers(values) => values.iter().flat_map(|value| value.to_le_bytes()).collect(),
@@ -44,7 +44,7 @@ fn plain(values: &Values) -> Vec<u8> {
     }
 }
 
-// Numbers of parquet.thrift.
+// Constants of parquet.thrift.
 const INT64: i64 = 2;
 const DOUBLE: i64 = 5;
 const BYTE_ARRAY: i64 = 6;
@@ -55,11 +55,11 @@ const RLE: i64 = 3;
 const UNCOMPRESSED: i64 = 0;
 const DATA_PAGE: i64 = 0;
 
-/// Thrift's compact protocol: fields by the difference of their numbers, integers in zigzag.
+/// Writer of Thrift's compact protocol: field numbers as differences, integers in zigzag encoding.
 #[derive(Debug, Default)]
 struct Thrift {
     bytes: Vec<u8>,
-    /// Number of the field before, of each structure that is open.
+    /// Number of the previous field of each open structure.
     fields: Vec<i16>,
 }
 
@@ -79,7 +79,7 @@ impl Thrift {
         self.fields.pop();
     }
 
-    /// Numbers ascend within a structure, by less than 16.
+    /// Writes a field header. Numbers within a structure must increase by less than 16.
     fn field(&mut self, number: i16, kind: u8) {
         if let Some(before) = self.fields.last_mut() {
             self.bytes.push(((number - *before) as u8) << 4 | kind);
@@ -140,7 +140,7 @@ fn page_header(len: usize, rows: usize) -> Vec<u8> {
     thrift.begin();
     thrift.i32(1, rows as i64);
     thrift.i32(2, PLAIN);
-    // Of levels that a required column at the top does not have.
+    // Encodings of levels, which required columns do not have.
     thrift.i32(3, RLE);
     thrift.i32(4, RLE);
     thrift.end();
@@ -210,9 +210,9 @@ fn footer(table: &Table, chunks: &[(usize, usize)]) -> Vec<u8> {
 mod tests {
     use super::*;
 
-    /// `tests/pose` reads whole tables by pyarrow; this is of the bytes.
+    /// Checks the bytes; `tests/pose` reads complete tables with pyarrow.
     #[test]
-    fn a_file_is_framed_as_the_format_says() {
+    fn writes_the_framing_of_the_format() {
         let mut table = Table::default();
         table.integers("a", [1, 2, 3].into_iter());
         table.texts("b", ["x", "", "long"].map(str::to_owned).into_iter());

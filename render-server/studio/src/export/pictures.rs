@@ -1,4 +1,4 @@
-//! The images of a flight, one after the other, decoded.
+//! Decodes the images of a flight, one after the other.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -9,16 +9,16 @@ use vizflyt_rgbd::{Decoder, peek};
 use vizflyt_runtime::log::data::{FlightData, FlightDatum, FlightImage};
 use vizflyt_runtime::log::read::LogReader;
 
-/// Reads and decodes them; keeps its memory from one to the next.
+/// Reader and decoder of images, which reuses its memory.
 pub(super) struct Pictures {
     data: FlightData<BufReader<File>>,
     path: PathBuf,
     decoder: Decoder,
-    /// H x W x 3, sRGB, of the image that was returned last.
+    /// Colours of the last returned image, H x W x 3, sRGB.
     pub(super) rgb: Vec<u8>,
-    /// H x W, camera z, 0 where there is no return. [mm, cam]
+    /// Depth of the last returned image, H x W, along the optical axis; 0: no depth. [mm, cam]
     pub(super) depth_mm: Vec<u16>,
-    /// Images that do not decode.
+    /// Number of images that do not decode.
     pub(super) broken: usize,
 }
 
@@ -36,8 +36,8 @@ impl Pictures {
         })
     }
 
-    /// Returns the next image that `wants` takes, whose pixels are in [`Self::rgb`] and [`Self::depth_mm`]; `None` at the
-    /// end.
+    /// Returns the next image that `wants` accepts; `None` at the end. Its pixels are in [`Self::rgb`] and
+    /// [`Self::depth_mm`].
     pub(super) fn next(
         &mut self,
         wants: impl Fn(&FlightImage) -> bool,
@@ -71,7 +71,7 @@ impl Pictures {
         self.decoder.decode(&image.bitstream, &mut self.rgb, &mut self.depth_mm).ok()
     }
 
-    /// Whether the image that was returned last has any depth: where the course withholds it, it has none.
+    /// Whether the last returned image has any depth. It has none if the course withholds depth.
     pub(super) fn has_depth(&self) -> bool {
         self.depth_mm.iter().any(|mm| *mm > 0)
     }

@@ -1,12 +1,12 @@
-//! Readings of the sensors beside the cameras: a LiDAR's sweeps as PCD files (the format of the Point Cloud Library, which Open3D
-//! and CloudCompare read), the others' as a table each.
+//! Readings of sensors other than cameras: sweeps of a LiDAR as PCD files (the format of the Point Cloud Library, which
+//! Open3D and CloudCompare read), and a table for each other sensor.
 //!
 //! ```text
-//! NAME/sensor.yaml   kind and place in the body, as EuRoC has it for cameras
-//! NAME/data.csv      a LiDAR's: instants and files; a range finder's or sonar's: distances; a radar's: a row a detection
+//! NAME/sensor.yaml   kind and pose in the body, in EuRoC's format
+//! NAME/data.csv      LiDAR: times and files; range finder or sonar: distances; radar: one row per detection
 //! NAME/data/NS.pcd   one sweep: x y z before_ns intensity ring, in the sensor's axes
 //! ```
-//! `NS` is the instant that a reading is of, since 1970.
+//! `NS` is the time of a reading since 1970.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -24,14 +24,14 @@ use super::files::Folder;
 use super::table::file_name;
 use super::{context, write_text};
 
-/// What one sensor has measured.
+/// Readings of a sensor.
 struct Measured {
     header: SensorHeader,
     stamps: Vec<u64>,
     csv: String,
 }
 
-/// Writes the readings of a log below `above`, a folder for each sensor. Returns how many.
+/// Writes the readings of a log below `above`, in a folder for each sensor. Returns the number of readings.
 pub(super) fn write(folder: &Folder, log: &Path, above: &str) -> Result<usize> {
     let name = || format!("cannot read {}", log.display());
     let mut data = FlightData::new(LogReader::open(log).with_context(name)?, true);
@@ -77,7 +77,7 @@ fn head(kind: SensorKind) -> &'static str {
     }
 }
 
-/// Returns a reading's rows: of a radar that detects nothing none; of a beam that nothing came back from, an empty range.
+/// Returns the rows of a reading. A radar without detections has none. A beam without a return has an empty range.
 fn rows(kind: SensorKind, reading: &FlightReading) -> String {
     let at_ns = reading.at_ns;
     let mut text = String::new();
@@ -106,7 +106,8 @@ fn rows(kind: SensorKind, reading: &FlightReading) -> String {
     text
 }
 
-/// Returns points as a PCD file (pointclouds.org, "The PCD file format", 0.7): its binary form is the very bytes of memory.
+/// Returns points as a PCD file (pointclouds.org, "The PCD file format", 0.7). Its binary form has the memory layout of
+/// the records.
 fn pcd(records: &[u8]) -> Vec<u8> {
     let points = records.len() / size_of::<LidarPoint>();
     let head = format!(
@@ -130,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_there_has_no_number() {
+    fn missing_returns_have_no_range() {
         let far = RangeReading { range_m: 2.5, signal: 3.0 };
         assert_eq!(rows(SensorKind::Sonar, &reading(far.as_bytes())), "5,2.5,3\n");
         let nothing = RangeReading::default();
@@ -142,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sweep_is_its_head_and_its_bytes() {
+    fn writes_a_sweep_as_header_and_raw_records() {
         let points = [LidarPoint { p_m: [1.0, 2.0, 3.0], ring: 7, ..LidarPoint::default() }; 3];
         let file = pcd(points.as_bytes());
         let head = file.len() - points.as_bytes().len();

@@ -1,5 +1,5 @@
-//! The flight as tables: each image's row, poses, IMU, setpoints, the plugin's own estimate. EuRoC's and TUM's folders
-//! have those beside them, as CSV, for which these layouts have no place.
+//! Tables of a flight: images, poses, IMU, setpoints, the plugin's odometry. The layouts of EuRoC and TUM lack some of
+//! them, which are written as additional CSV files.
 
 use anyhow::Result;
 use vizflyt_runtime::log::data::FlightImage;
@@ -10,7 +10,7 @@ use super::motion::{FlightTracks, Interpolated};
 use super::pictures::Pictures;
 use super::{Written, parquet, seconds_text, write_text};
 
-/// An image that was written, and where.
+/// Written image and its files.
 #[derive(Debug)]
 pub(super) struct Row {
     pub(super) image: FlightImage,
@@ -53,7 +53,7 @@ pub(super) fn write(
     Ok(Written { images: rows.len(), broken: pictures.broken })
 }
 
-/// Writes beside EuRoC's or TUM's files what these have no place for.
+/// Writes the tables that the layouts of EuRoC and TUM lack.
 pub(super) fn write_beside(folder: &Folder, motion: &FlightTracks, rows: &[Row]) -> Result<()> {
     for (name, table) in [
         ("images.csv", images(motion, rows)),
@@ -74,7 +74,7 @@ pub(super) fn write_beside(folder: &Folder, motion: &FlightTracks, rows: &[Row])
     write_text(&folder.at("odometry.tum")?, &text)
 }
 
-/// Returns a camera's name as it may stand in a path.
+/// Returns the name of a camera with only characters that are safe in a path.
 pub(super) fn file_name(camera: &str) -> String {
     let safe = |letter: char| {
         if letter.is_ascii_alphanumeric() || "-_".contains(letter) { letter } else { '_' }
@@ -97,7 +97,7 @@ fn images(motion: &FlightTracks, rows: &[Row]) -> Table {
     let k = || all().map(|image| image.header.intrinsics());
     table.numbers("fx_px", k().map(|k| k.fx_px));
     table.numbers("fy_px", k().map(|k| k.fy_px));
-    // OpenCV's: the centre of the first pixel is 0.
+    // OpenCV's convention: the centre of the first pixel is 0.
     table.numbers("cx_px", k().map(|k| k.cx_px - 0.5));
     table.numbers("cy_px", k().map(|k| k.cy_px - 0.5));
     let mount = || all().map(|image| image.header.body_from_cam());

@@ -1,5 +1,5 @@
-//! The layout of TU Munich's RGB-D benchmark (J. Sturm et al., IROS 2012): `rgb/`, `depth/` as 16-bit PNG of 5000 units a
-//! metre, lists of both, `accelerometer.txt`, and `groundtruth.txt`, which is of the camera's optical frame.
+//! Layout of TU Munich's RGB-D benchmark (J. Sturm et al., IROS 2012): `rgb/`, `depth/` as 16-bit PNG with 5000 units
+//! per metre, lists of both, `accelerometer.txt`, and `groundtruth.txt` of the camera's optical frame.
 
 use std::fmt::Write;
 
@@ -12,10 +12,10 @@ use super::pictures::Pictures;
 use super::table::{Row, write_beside};
 use super::{Written, seconds_text, write_text};
 
-/// 5000 units a metre.
+/// 5000 units per metre.
 const UNITS_PER_MM: u16 = 5;
 
-/// Writes it, of the camera of this name or the first one.
+/// Writes the data set of the camera with this name, or of the first one.
 pub(super) fn write(
     folder: &Folder,
     motion: &FlightTracks,
@@ -26,7 +26,7 @@ pub(super) fn write(
     let mut rows: Vec<Row> = Vec::new();
     let (mut rgb, mut depth, mut both) = (list("color images"), list("depth maps"), String::new());
     let mut shown =
-        "# where each image was rendered from: timestamp tx ty tz qx qy qz qw\n".to_owned();
+        "# camera pose from which each image was rendered: timestamp tx ty tz qx qy qz qw\n".to_owned();
     while let Some(mut image) =
         pictures.next(|image| chosen.as_ref().is_none_or(|name| *name == image.camera))?
     {
@@ -49,7 +49,7 @@ pub(super) fn write(
     }
     ensure!(
         !rows.is_empty(),
-        "there is no image of a camera '{}' that decodes; without --camera the first one is taken",
+        "no image of a camera '{}' can be decoded; without --camera, the first camera is used",
         chosen.unwrap_or_default()
     );
     let body_from_cam = rows.first().context("no image")?.image.header.body_from_cam();

@@ -1,16 +1,16 @@
-//! Optical flow, from depth and how things move.
+//! Optical flow from depth and the motion of camera and objects.
 
 use glam::Mat3;
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose};
 use vizflyt_splat::simd::{InstructionSet, Kernel, Simd};
 
-/// The pass and what it keeps from image to image.
+/// Computation of optical flow, with buffers that are reused.
 #[derive(Debug)]
 pub struct Flow {
     instructions: InstructionSet,
-    /// Depth of a row, and behind it what a vector reads more. [m, cam]
+    /// Depth of a row, padded for vector reads. [m, cam]
     depth_m: Vec<f32>,
-    /// Flow of a row to the right and down, as files have it.
+    /// Encoded flow of a row to the right and down.
     row: [Vec<f32>; 2],
 }
 
@@ -22,12 +22,13 @@ impl Default for Flow {
 }
 
 impl Flow {
-    /// Writes optical flow, H x W x 3, as the KITTI benchmark has it (Geiger et al. 2012, its development kit): 16 bits each of
-    /// `64 u + 2^15` and `64 v + 2^15` pixels, then 1 where there is flow, 0 where not: nothing was hit, it goes behind the camera,
-    /// or farther than 16 bits hold. Where a pixel's surface is in the next image; it may be hidden there.
+    /// Writes optical flow, H x W x 3, in the format of the KITTI benchmark (Geiger et al. 2012, development kit):
+    /// `64 u + 2^15` and `64 v + 2^15` with 16 bits each, then 1 for valid flow and 0 for none. There is no flow if
+    /// nothing was hit, if the point moves behind the camera, or if the flow exceeds 16 bits. Flow is the position of a
+    /// pixel's surface in the next image, where it may be hidden.
     ///
-    /// Depth is along the optical axis, H x W, 0 where there is none [m, cam]; `ids` is of the same pixels. `next_from_cam` is of
-    /// what stands still; `of_id` of what moves, by its id. [next cam, cam]
+    /// `depth_m` is along the optical axis, H x W, 0 for none [m, cam]; `ids` has the same pixels. `next_from_cam` is
+    /// the motion of static surfaces, `of_id` that of moving objects by their ids. [next cam, cam]
     pub fn write(
         &mut self,
         k: &Intrinsics,
@@ -57,7 +58,7 @@ impl Flow {
         }
     }
 
-    /// Writes the pixels of a row that are of one motion.
+    /// Writes the pixels of a row that belong to one motion.
     fn row_of(
         &mut self,
         k: &Intrinsics,
@@ -71,7 +72,7 @@ impl Flow {
         self.instructions.run(Row { k, v: y as f32 + 0.5, next_from_cam, depth_m, out: [du, dv] });
         for (x, (out, (&du, &dv))) in out.chunks_exact_mut(3).zip(du.iter().zip(&*dv)).enumerate() {
             if is_of(x) {
-                // NaN is in no range.
+                // No range contains NaN.
                 let is_held = (0.0..65536.0).contains(&du) && (0.0..65536.0).contains(&dv);
                 let flow = if is_held { [du as u16, dv as u16, 1] } else { [0; 3] };
                 out.copy_from_slice(&flow);
@@ -80,14 +81,14 @@ impl Flow {
     }
 }
 
-/// Works out where the points of a row are next.
+/// Kernel that computes the next positions of a row's points.
 struct Row<'a> {
     k: &'a Intrinsics,
-    /// Of the row's middle. [px]
+    /// Centre of the row. [px]
     v: f32,
     next_from_cam: &'a Pose<Cam, Cam>,
     depth_m: &'a [f32],
-    /// As files have it; NaN where there is none.
+    /// Encoded flow; NaN for none.
     out: [&'a mut [f32]; 2],
 }
 
@@ -101,7 +102,7 @@ impl Kernel for Row<'_> {
         let rotation = Mat3::from_quat(next_from_cam.rotation.as_quat()).to_cols_array_2d();
         let moved_m = next_from_cam.translation_m.as_vec3().to_array();
         let slope_y = (v - cy) / fy;
-        // At slope x and depth z the point is next at (x column + rest) z + moved.
+        // A point with slope x and depth z moves to (x column + rest) z + moved.
         let rest = [0, 1, 2].map(|row| rotation[1][row] * slope_y + rotation[2][row]);
         let column = broadcast(s, rotation[0]);
         let rest = broadcast(s, rest);
@@ -137,9 +138,9 @@ fn broadcast<S: Simd>(s: S, v: [f32; 3]) -> [S::F; 3] {
     [s.splat(v[0]), s.splat(v[1]), s.splat(v[2])]
 }
 
-/// Of the widest instruction set.
+/// Lanes of the widest instruction set.
 const MOST_LANES: usize = 16;
-/// What is nearer in the next image is behind its camera. [m, cam]
+/// Minimum depth in the next image; points below it count as behind the camera. [m, cam]
 const NEAREST_M: f32 = 0.02;
 
 #[cfg(test)]
@@ -152,7 +153,7 @@ pub(crate) mod tests {
         Intrinsics { cx_px: 30.0, cy_px: 25.5, ..Intrinsics::from_horizontal_fov(64, 48, 1.4) }
     }
 
-    /// Depth of the plane `normal . p = offset`. [m]
+    /// Returns the depth of the plane `normal . p = offset`. [m]
     pub(crate) fn plane(k: &Intrinsics, normal: DVec3, offset_m: f64) -> Vec<f32> {
         let pixel = |n: u32| {
             let at = DVec2::new(f64::from(n % 64) + 0.5, f64::from(n / 64) + 0.5);
@@ -174,7 +175,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn flow_leads_to_where_points_are_next() {
+    fn flow_matches_the_projected_motion() {
         let k = camera();
         let depth_m = plane(&k, DVec3::new(0.1, -0.4, -1.0), -2.0);
         let next_from_cam: Pose<Cam, Cam> =
@@ -195,7 +196,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn flow_is_not_where_nothing_is_or_behind_the_camera() {
+    fn no_flow_without_depth_or_behind_the_camera() {
         let k = camera();
         let mut depth_m = plane(&k, DVec3::NEG_Z, -2.0);
         depth_m[7] = 0.0;

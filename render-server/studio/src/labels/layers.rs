@@ -1,9 +1,10 @@
-//! Layers that need no more than a pixel: depth of surfaces, classes, ids of things.
+//! Layers that are computed pixel by pixel: depth of surfaces, classes, ids of things.
 
 use vizflyt_splat::RgbdImage;
 
-/// Writes camera-z depth of the surfaces that pixels show, row-major; 0 is none. The expected depth, which is smooth along a
-/// surface, where it is that of the median splat; the median, which lies between no two surfaces, elsewhere. [m, cam]
+/// Writes the depth of visible surfaces along the optical axis, row-major; 0: none. If expected and median depth belong
+/// to the same surface, it uses the expected depth, which is smooth along a surface. Otherwise, it uses the median
+/// depth, which never lies between two surfaces. [m, cam]
 pub fn surface_depth(image: &RgbdImage, out: &mut Vec<f32>) {
     out.clear();
     let depths = image.depth_median_m.iter().zip(&image.depth_expected_m).zip(&image.alpha);
@@ -14,7 +15,7 @@ pub fn surface_depth(image: &RgbdImage, out: &mut Vec<f32>) {
     }));
 }
 
-/// Writes depth [m] in whole millimetres, 0 where there is none or beyond 65.535 m.
+/// Converts depth [m] to integer millimetres; 0 for none or beyond 65.535 m.
 pub fn depth_mm(depth_m: &[f32], out: &mut Vec<u16>) {
     out.clear();
     out.extend(depth_m.iter().map(|depth_m| {
@@ -23,10 +24,10 @@ pub fn depth_mm(depth_m: &[f32], out: &mut Vec<u16>) {
     }));
 }
 
-/// Writes the class of each pixel by that of its id, `of_id`; 0 where there is no depth.
+/// Writes the class of each pixel, from the class of its id in `of_id`; 0 for pixels without depth.
 ///
 /// # Panics
-/// If an id has no class.
+/// An id has no class.
 pub fn classes(depth_m: &[f32], ids: &[u16], of_id: &[u8], out: &mut Vec<u8>) {
     out.clear();
     let pixels = depth_m.iter().zip(ids);
@@ -36,10 +37,10 @@ pub fn classes(depth_m: &[f32], ids: &[u16], of_id: &[u8], out: &mut Vec<u8>) {
     }));
 }
 
-/// Writes the id of each pixel that is of a thing, by `is_thing` of its id; 0 of all others and where there is no depth.
+/// Writes the ids of pixels of things, according to `is_thing`; 0 for all others and for pixels without depth.
 ///
 /// # Panics
-/// If an id is beyond `is_thing`.
+/// An id is beyond the end of `is_thing`.
 pub fn instances(depth_m: &[f32], ids: &[u16], is_thing: &[bool], out: &mut Vec<u16>) {
     out.clear();
     let pixels = depth_m.iter().zip(ids);
@@ -49,7 +50,7 @@ pub fn instances(depth_m: &[f32], ids: &[u16], is_thing: &[bool], out: &mut Vec<
     }));
 }
 
-/// Expected and median depth are of one surface within this. [m], and of the depth.
+/// Maximum difference of expected and median depth on one surface. [m], and relative to the depth.
 const SAME_M: f32 = 0.02;
 const SAME: f32 = 0.02;
 
@@ -58,7 +59,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn depth_is_smooth_on_a_surface_and_sharp_at_edges() {
+    fn depth_is_smooth_on_surfaces_and_sharp_at_edges() {
         let mut image = RgbdImage::default();
         image.resize(4, 1);
         image.alpha = vec![1.0, 1.0, 0.4, 1.0];

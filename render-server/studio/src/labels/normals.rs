@@ -1,19 +1,19 @@
-//! Normals of surfaces, from their depth.
+//! Surface normals from depth.
 //!
-//! Along a plane 1 / z is linear in pixels (with `n . p = d` and p = z (x, y, 1): 1 / z = n . (x, y, 1) / d). So the slopes of 1 / z
-//! give the normal, and a plane fitted to the pixels around by least squares gives the slopes: splats are off their wall by
-//! some per cent of its distance, each by its own, and only a window of several splats has the wall's slope.
+//! On a plane, 1 / z is linear in pixels (with `n . p = d` and p = z (x, y, 1): 1 / z = n . (x, y, 1) / d). Therefore,
+//! the slopes of 1 / z define the normal. They are found by a least-squares fit to the surrounding pixels: the depth of
+//! each splat is off by some percent of the distance, and only a window of several splats has the slope of the wall.
 
 use vizflyt_protocol::geometry::Intrinsics;
 use vizflyt_splat::simd::{InstructionSet, Kernel, Simd};
 
-/// The pass and what it keeps from image to image.
+/// Computation of normals, with buffers that are reused.
 #[derive(Debug)]
 pub struct Normals {
     instructions: InstructionSet,
-    /// 1 / z with [`REACH`] rows and columns of nothing around, and behind each row what a vector reads more. [1/m]
+    /// 1 / z with a border of [`REACH`] empty rows and columns, and rows padded for vector reads. [1/m]
     inverse: Vec<f32>,
-    /// Normals along a row, each axis as files have it; NaN where there is none.
+    /// Encoded normals of a row, for each axis; NaN for none.
     row: [Vec<f32>; 3],
 }
 
@@ -25,8 +25,8 @@ impl Default for Normals {
 }
 
 impl Normals {
-    /// Writes the surfaces' unit normals towards the camera, H x W x 3, each axis of `cam` as `round(127.5 (n + 1))`; black where
-    /// there is none. From camera-z depth, H x W, 0 where there is none. [m, cam]
+    /// Writes unit normals towards the camera, H x W x 3, with each axis of `cam` encoded as `round(127.5 (n + 1))`;
+    /// black for none. `depth_m` is along the optical axis, H x W, 0 for none. [m, cam]
     pub fn write(&mut self, k: &Intrinsics, depth_m: &[f32], out: &mut Vec<u8>) {
         let (width, height) = (k.width_px as usize, k.height_px as usize);
         let across = width.next_multiple_of(MOST_LANES);
@@ -58,11 +58,11 @@ impl Normals {
     }
 }
 
-/// Fits a plane at each pixel of a row.
+/// Kernel that fits a plane at each pixel of a row.
 struct Row<'a> {
     k: &'a Intrinsics,
     y: usize,
-    /// 1 / z of the rows around and the row in their middle.
+    /// 1 / z of the row and the rows around it.
     rows: &'a [f32],
     pitch: usize,
     out: [&'a mut [f32]; 3],
@@ -85,7 +85,7 @@ impl Kernel for Row<'_> {
         for x in (0..out[0].len()).step_by(S::LANES) {
             let here = s.load(&rows[REACH * pitch + REACH + x..]);
             let step = here * s.splat(STEP);
-            // Sums over the window, of the products of steps to the sides, down, and of 1 / z.
+            // Sums over the window of the products of horizontal steps, vertical steps, and changes of 1 / z.
             let (mut xx, mut xy, mut yy, mut xz, mut yz) = (zero, zero, zero, zero, zero);
             for &(dx, dy) in &AROUND {
                 let start = ((REACH as i32 + dy) * pitch as i32 + REACH as i32 + dx) as usize + x;
@@ -99,14 +99,14 @@ impl Kernel for Row<'_> {
                 xy = xy + s.keep(same, s.splat(dx * dy));
                 yy = yy + s.keep(same, s.splat(dy * dy));
             }
-            // Slopes times the determinant, which a normal's length takes out again.
+            // Slopes times the determinant, which cancels in the normalization.
             let determinant = xx * yy - xy * xy;
             let a = (yy * xz - xy * yz) * s.splat(fx);
             let b = (xx * yz - xy * xz) * s.splat(fy);
             let at_x = (middles + s.splat(x as f32)) / s.splat(fx);
             let c = determinant * here - a * at_x - b * at_y;
             let length = s.sqrt(a * a + b * b + c * c);
-            // Where all are on one line there is no plane: sums of whole numbers are exact.
+            // Pixels on one line define no plane. The comparison is safe because sums of integers are exact.
             let is_plane = s.lt(s.splat(0.5), determinant);
             let scale = s.select(is_plane, s.splat(-127.5) / length, s.splat(f32::NAN));
             for (axis, out) in [a, b, c].into_iter().zip(&mut out) {
@@ -116,14 +116,14 @@ impl Kernel for Row<'_> {
     }
 }
 
-/// The window reaches so far. [px]
+/// Radius of the window. [px]
 const REACH: usize = 5;
-/// Every other pixel of a disc: with all of them normals are hardly better.
+/// Offsets of the window: every other pixel of a disc, because using all hardly improves normals.
 const AROUND: [(i32, i32); 44] = around();
-/// Of the widest instruction set.
+/// Lanes of the widest instruction set.
 const MOST_LANES: usize = 16;
-/// A step of 1 / z that is more than this share of it is an edge: a floor 1.2 m below is one surface up to where it is 12 pixels
-/// below the horizon.
+/// A relative change of 1 / z above this is an edge: a floor 1.2 m below is one surface up to 12 pixels below the
+/// horizon.
 const STEP: f32 = 0.08;
 
 const fn around() -> [(i32, i32); 44] {
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn a_planes_normals_are_its_own() {
+    fn computes_the_normals_of_planes() {
         let k = camera();
         let mut bytes = Vec::new();
         for normal in [DVec3::NEG_Z, DVec3::new(0.3, -0.5, -1.0), DVec3::new(-0.6, 0.1, -0.7)] {
@@ -163,7 +163,7 @@ mod tests {
             for (n, bytes) in (0u32..).zip(bytes.chunks_exact(3)) {
                 let at = DVec2::new(f64::from(n % 64) + 0.5, f64::from(n / 64) + 0.5);
                 let ray = k.unproject(at, 1.0).unwrap().normalize();
-                // Beside the plane's vanishing line 1 / z changes by too much from pixel to pixel to be one surface.
+                // Near the vanishing line of the plane, 1 / z changes too much from pixel to pixel to be one surface.
                 if bytes == [0; 3] && normal.dot(ray).abs() < 0.2 {
                     continue;
                 }
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn edges_do_not_bend_normals_and_nothing_has_none() {
+    fn edges_do_not_change_normals_and_missing_depth_has_none() {
         let k = camera();
         let mut depth_m = plane(&k, DVec3::NEG_Z, -3.0);
         for (n, z_m) in depth_m.iter_mut().enumerate() {

@@ -1,22 +1,19 @@
-//! PNG and JPEG of layers, in memory: the same bytes for the same pixels.
+//! Encoding of layers as PNG and JPEG in memory. The same pixels give the same bytes.
 //!
-//! Budget on one core, 320x240: most of an image's time beside its rendering; fast deflate and one filter for all rows, by
-//! layer.
+//! Encoding takes most of an image's time after rendering, so it uses fast deflate and one filter per layer.
 
 use png::{BitDepth, ColorType, DeflateCompression, Encoder, Filter};
 
-/// Why there is no file.
+/// Error of an encoder.
 #[derive(Debug, thiserror::Error)]
 pub enum EncodeError {
-    /// Of a PNG.
     #[error("cannot encode a PNG")]
     Png(#[from] png::EncodingError),
-    /// Of a JPEG.
     #[error("cannot encode a JPEG")]
     Jpeg(#[from] vizflyt_rgbd::EncodeError),
 }
 
-/// Encodes RGB, 8 bits each.
+/// Encodes RGB with 8 bits per channel.
 ///
 /// # Errors
 /// [`EncodeError`].
@@ -24,7 +21,7 @@ pub fn rgb8(rgb: &[u8], size: [u32; 2]) -> Result<Vec<u8>, EncodeError> {
     png(rgb, size, (ColorType::Rgb, BitDepth::Eight), Filter::Paeth)
 }
 
-/// Encodes one channel of 8 bits: long runs.
+/// Encodes one channel of 8 bits, with a filter for long runs.
 ///
 /// # Errors
 /// [`EncodeError`].
@@ -76,7 +73,7 @@ fn png(
     Ok(out)
 }
 
-/// PNG has the high byte first.
+/// Converts samples to the big-endian order of PNG.
 fn bytes(samples: &[u16]) -> Vec<u8> {
     let mut bytes = vec![0; 2 * samples.len()];
     for (pair, sample) in bytes.chunks_exact_mut(2).zip(samples) {
@@ -90,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pixels_come_back() {
+    fn encoding_is_lossless() {
         let samples: Vec<u16> = (0..3 * 35).map(|n| n * 613).collect();
         let flow = image::load_from_memory(&rgb16(&samples, [7, 5]).unwrap()).unwrap();
         assert_eq!(flow.as_rgb16().unwrap().as_raw(), &samples);

@@ -1,22 +1,22 @@
-//! Masks as COCO writes them: run lengths down the columns, as counts and as COCO's text of them.
+//! Masks in COCO's format: run lengths along columns, as counts and as COCO's compressed text.
 //!
-//! (Lin et al. 2014, "Microsoft COCO"; the text is that of `rleToString` in `maskApi.c` of its tools.) A mask is the set of
-//! pixels of one id in an image of ids.
+//! Source: Lin et al. 2014, "Microsoft COCO"; the text matches `rleToString` in `maskApi.c` of its tools. A mask is the
+//! set of pixels with one id in an image of ids.
 
 use std::collections::BTreeMap;
 
-/// One id's pixels.
+/// Pixels of an id.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mask {
-    /// Lengths of runs down the columns, from the left; the first is of pixels outside, and may be 0.
+    /// Run lengths along the columns, from the left. The first run is outside of the mask and can be 0.
     pub counts: Vec<u32>,
-    /// Number of pixels inside.
+    /// Number of pixels in the mask.
     pub area_px: u32,
-    /// The tight box: left, top, width, height. [px]
+    /// Tight box: left, top, width, height. [px]
     pub box_px: [u32; 4],
 }
 
-/// Returns the mask of each id that is not 0. Row-major ids in.
+/// Returns the mask of each id except 0, from row-major ids.
 pub fn masks(ids: &[u16], [width, height]: [usize; 2]) -> BTreeMap<u16, Mask> {
     debug_assert_eq!(ids.len(), width * height);
     let mut runs: BTreeMap<u16, Runs> = BTreeMap::new();
@@ -40,7 +40,7 @@ pub fn masks(ids: &[u16], [width, height]: [usize; 2]) -> BTreeMap<u16, Mask> {
 #[derive(Default)]
 struct Runs {
     counts: Vec<u32>,
-    /// Where the last run ended, down the columns.
+    /// End of the last run, in column-major order.
     end: u32,
     area_px: u32,
     rows: Option<[u32; 2]>,
@@ -51,7 +51,7 @@ impl Runs {
     fn add(&mut self, [x, from, to]: [usize; 3], height: usize) {
         let (start, length) = ((x * height + from) as u32, (to - from) as u32);
         match self.counts.last_mut() {
-            // Goes on from the foot of one column to the head of the next.
+            // The run continues from the bottom of one column to the top of the next.
             Some(last) if self.end == start => *last += length,
             _ => self.counts.extend([start - self.end, length]),
         }
@@ -77,7 +77,7 @@ impl Runs {
     }
 }
 
-/// Returns counts as COCO's text: differences to the count before last, five bits a character.
+/// Returns counts as COCO's text: differences to the count before the last, five bits per character.
 pub fn to_text(counts: &[u32]) -> String {
     let mut text = String::new();
     for (n, &count) in counts.iter().enumerate() {
@@ -96,7 +96,7 @@ pub fn to_text(counts: &[u32]) -> String {
     text
 }
 
-/// Returns the counts of COCO's text; `None` where it is none.
+/// Returns the counts of COCO's text; `None` if it is invalid.
 pub fn from_text(text: &str) -> Option<Vec<u32>> {
     let mut counts: Vec<u32> = Vec::new();
     let mut bytes = text.bytes();
@@ -123,7 +123,7 @@ pub fn from_text(text: &str) -> Option<Vec<u32>> {
     Some(counts)
 }
 
-/// Returns which pixels counts are of, row-major; `None` if they do not fill the image.
+/// Returns the mask of counts as row-major pixels; `None` if they do not fill the image.
 pub fn to_pixels(counts: &[u32], [width, height]: [usize; 2]) -> Option<Vec<bool>> {
     let mut pixels = vec![false; width * height];
     let mut at = 0usize;
@@ -146,8 +146,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_text_is_that_of_cocos_tools() {
-        // pycocotools.mask.encode of a 4 x 3 mask whose pixels (1, 1), (1, 2), (2, 1) are set.
+    fn writes_the_same_text_as_cocos_tools() {
+        // pycocotools.mask.encode of a 4 x 3 mask with the pixels (1, 1), (1, 2), (2, 1).
         #[rustfmt::skip]
         let ids = [0, 0, 0, 0,
                    0, 7, 7, 0,
@@ -161,7 +161,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn masks_come_back(
+        fn masks_survive_a_round_trip(
             size in (1usize..20, 1usize..20),
             seed in prop::collection::vec(0u16..4, 400),
         ) {
@@ -188,12 +188,12 @@ mod tests {
         }
 
         #[test]
-        fn counts_of_any_length_come_back(counts in prop::collection::vec(0u32..1 << 27, 0..9)) {
+        fn counts_survive_a_round_trip(counts in prop::collection::vec(0u32..1 << 27, 0..9)) {
             prop_assert_eq!(from_text(&to_text(&counts)).unwrap(), counts);
         }
 
         #[test]
-        fn any_text_is_read_or_refused(text in "\\PC{0,40}") {
+        fn never_panics_on_any_text(text in "\\PC{0,40}") {
             if let Some(counts) = from_text(&text) {
                 let _ = to_pixels(&counts, [7, 5]);
             }

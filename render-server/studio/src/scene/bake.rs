@@ -1,4 +1,4 @@
-//! `vizflyt scene bake`: obstacles from splats, ahead of the first flight, with what became of them.
+//! `vizflyt scene bake`: converts splats into obstacles before the first flight, and prints a summary.
 
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
@@ -15,39 +15,39 @@ use vizflyt_server::scene::{
     BakeCache, Baked, BareArgs, bake_with, check_fit, is_in_an_arena, load,
 };
 
-/// Bakes a scene's obstacles for the referee, and keeps them for serve, demo and grade.
+/// Bake the obstacles of a scene, and store them for serve, demo and grade
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt scene bake my-forest
   vizflyt scene bake my-forest --voxel 0.1 --json")]
 pub(crate) struct BakeArgs {
-    /// arena.toml, its folder, or a bare scene file, for which an arena is made up
+    /// arena.toml, its folder, or a scene file, which gets a default arena
     scene: PathBuf,
-    /// Another side of a voxel than that of [occupancy], to compare
+    /// Voxel size instead of that of [occupancy], for comparison
     #[arg(long, value_name = "METRES")]
     voxel: Option<f64>,
-    /// Bakes even if it is kept from an earlier time
+    /// Bake even if stored obstacles exist
     #[arg(long)]
     force: bool,
     #[command(flatten)]
     bare: BareArgs,
-    /// Prints one JSON object
+    /// Print one JSON object
     #[arg(long)]
     json: bool,
 }
 
-/// What `--json` prints.
+/// Output of `--json`.
 #[derive(Debug, Serialize)]
 struct BakeReport {
     splats: usize,
     voxel_m: f64,
     voxels: usize,
-    /// Of the field, which is what a server holds. [MB]
+    /// Memory of the distance field, as in a server. [MB]
     memory_mb: f64,
-    /// Whether it was kept from an earlier bake.
+    /// Whether the obstacles come from the cache.
     kept: bool,
     seconds: f64,
-    /// What the baker did; absent if it had nothing to do.
+    /// Counts of the bake; absent if the obstacles come from the cache.
     #[serde(flatten)]
     #[serde(skip_serializing_if = "Option::is_none")]
     counts: Option<Counts>,
@@ -58,7 +58,7 @@ struct BakeReport {
 #[derive(Debug, Serialize)]
 struct Counts {
     occupied: usize,
-    /// Of the occupied, those that no ray of the capture has passed.
+    /// Occupied voxels that no ray of the capture has passed.
     unseen: usize,
     floating: usize,
     enclosed: usize,
@@ -96,7 +96,7 @@ pub(crate) fn run(args: &BakeArgs) -> Result<()> {
     refuse(&findings, is_given || solid == 0)
 }
 
-/// Refuses what cannot be meant. An arena that was made up may be only a little off.
+/// Rejects implausible scenes. For a default arena, which may only be a little off, it prints warnings instead.
 fn refuse(findings: &[Finding], is_final: bool) -> Result<()> {
     if !is_final {
         for finding in findings {
@@ -108,7 +108,7 @@ fn refuse(findings: &[Finding], is_final: bool) -> Result<()> {
         return Ok(());
     }
     let lines: Vec<_> = findings.iter().map(ToString::to_string).collect();
-    bail!("this cannot be meant:\n  {}", lines.join("\n  "))
+    bail!("the scene does not fit its arena:\n  {}", lines.join("\n  "))
 }
 
 impl BakeReport {
@@ -144,7 +144,7 @@ impl BakeReport {
         if let Some(counts) = &self.counts {
             print_line(format!(
                 "obstacles    {} voxels solid, of which {} are unseen and {} were voids; {} floating voxels \
-                 and {} faint or outside splats left out",
+                 and {} faint or outside splats skipped",
                 counts.occupied,
                 counts.unseen,
                 counts.enclosed,
@@ -153,15 +153,15 @@ impl BakeReport {
             ));
         }
         if let Some(file) = &self.file {
-            print_line(format!("kept at      {file}"));
+            print_line(format!("stored at    {file}"));
         }
     }
 }
 
-/// A line on standard error that grows, if people watch.
+/// Progress bar on standard error, if it is a terminal.
 #[derive(Debug, Default)]
 struct Bar {
-    /// Percents shown; slabs finish in any order.
+    /// Highest percentage shown; slabs finish in any order.
     shown: Mutex<u32>,
 }
 
@@ -175,7 +175,7 @@ impl Bar {
         }
         *shown = percent;
         let filled = "#".repeat(percent as usize / 4);
-        // A terminal that is gone is no reason to stop.
+        // A closed terminal must not stop the bake.
         let _ = write!(error, "\rbaking [{filled:<25}] {percent:3} %").and_then(|()| error.flush());
     }
 

@@ -1,12 +1,12 @@
-//! CAM.json: one camera as the numpy oracle reads it (`splat_oracle.py`), and two keys more.
+//! CAM.json: camera in the format of the numpy reference renderer (`splat_oracle.py`), plus `near_m` and `distortion`.
 //!
 //! ```json
 //! {"fx": 251.1, "fy": 251.1, "cx": 160.0, "cy": 120.0, "w": 320, "h": 240, "bg": [0, 0, 0],
 //!  "w2c": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
 //!  "near_m": 0.01, "distortion": {"model": "brown-conrady", "k1": -0.1}}
 //! ```
-//! `w2c` takes points of the scene, as its file has them, to the camera: x right, y down, z
-//! forward. Pixel centres lie at +0.5. `bg`, `near_m` and `distortion` may be absent.
+//! `w2c` transforms points of the scene file to the camera: x right, y down, z forward. Pixel centres lie at +0.5.
+//! `bg`, `near_m` and `distortion` are optional.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -35,16 +35,16 @@ struct CameraFile {
     distortion: Option<LensConfig>,
 }
 
-/// The oracle's own. [m]
+/// Default of the reference renderer. [m]
 fn oracle_near_m() -> f32 {
     0.01
 }
 
-/// Reads a camera; its world is the frame of the scene's file.
+/// Reads a camera. Its world frame is the frame of the scene file.
 pub fn read(path: &Path) -> Result<Camera> {
     let text = std::fs::read_to_string(path)
         .with_context(|| format!("cannot read {} as a camera, a JSON file", path.display()))?;
-    parse(&text).with_context(|| format!("{} is no camera", path.display()))
+    parse(&text).with_context(|| format!("{} is not a valid camera", path.display()))
 }
 
 fn parse(text: &str) -> Result<Camera> {
@@ -62,9 +62,9 @@ fn parse(text: &str) -> Result<Camera> {
     let worst = off.to_cols_array().into_iter().fold(0.0, |a: f64, b| a.max(b.abs()));
     if !(worst < 1e-3 && rotation.determinant() > 0.0) {
         bail!(
-            "the left upper 3x3 of w2c is no rotation (its rows are {worst:.2e} off being \
-             orthonormal, its determinant is {:.3}); a scale belongs into the scene, and y points \
-             down, z forward",
+            "the upper left 3x3 of w2c is not a rotation (its rows deviate from orthonormal by {worst:.2e}, \
+             its determinant is {:.3}); apply a scale to the scene instead, and let y point down, \
+             z forward",
             rotation.determinant()
         );
     }
@@ -90,7 +90,7 @@ fn parse(text: &str) -> Result<Camera> {
     Ok(camera)
 }
 
-/// Returns the camera with an image of another size that shows the same.
+/// Returns the camera with another image size and the same field of view.
 pub fn resized(camera: &Camera, size: ImageSize) -> Result<Camera> {
     let k = camera.intrinsics;
     let [across, down] = [
@@ -111,12 +111,10 @@ pub fn resized(camera: &Camera, size: ImageSize) -> Result<Camera> {
     Ok(camera)
 }
 
-/// `--size WxH`.
+/// Image size, parsed from `WxH`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ImageSize {
-    /// Width. [px]
     pub width_px: u32,
-    /// Height. [px]
     pub height_px: u32,
 }
 
@@ -128,7 +126,7 @@ impl FromStr for ImageSize {
         let number = |side: &str| side.trim().parse().ok().filter(|&side: &u32| side > 0);
         match sides.map(|(width, height)| (number(width), number(height))) {
             Some((Some(width_px), Some(height_px))) => Ok(Self { width_px, height_px }),
-            _ => Err(format!("'{text}' is no size in pixels; write it as 640x480")),
+            _ => Err(format!("'{text}' is not a size in pixels; write it as 640x480")),
         }
     }
 }
@@ -146,9 +144,9 @@ mod tests {
     }
 
     #[test]
-    fn the_oracles_camera_is_read() {
+    fn reads_a_camera_of_the_reference_renderer() {
         let camera = parse(GOOD).unwrap();
-        // The world's x is ahead of it: row 2 of w2c.
+        // The world's x axis is the camera's forward axis: row 2 of w2c.
         let p_cam = camera.world_from_cam.inverse().transform_point(DVec3::X);
         assert!((p_cam - DVec3::new(1.0, 2.0, 4.0)).length() < 1e-12);
         assert_eq!((camera.near_m, camera.background), (0.01, [0.0; 3]));
@@ -157,18 +155,18 @@ mod tests {
     }
 
     #[test]
-    fn invalid_cameras_are_named() {
+    fn errors_name_the_problem_of_a_camera() {
         refused("{}", "missing field `fx`");
         refused(&GOOD.replace("\"cx\"", "\"near\""), "unknown field `near`");
         refused(&GOOD.replace("[0, 0, 0, 1]]", "[1, 2, 3, 1]]"), "is it transposed?");
-        refused(&GOOD.replace("[1, 0, 0, 3]", "[2, 0, 0, 3]"), "is no rotation");
+        refused(&GOOD.replace("[1, 0, 0, 3]", "[2, 0, 0, 3]"), "is not a rotation");
         refused(&GOOD.replace("[1, 0, 0, 3]", "[-1, 0, 0, 3]"), "determinant is -1.000");
         refused(&GOOD.replace("320", "0"), "image size 0x240");
         refused(&GOOD.replace("210", "-1"), "focal length");
     }
 
     #[test]
-    fn another_size_shows_the_same() {
+    fn another_size_keeps_the_field_of_view() {
         let camera = parse(GOOD).unwrap();
         let double = resized(&camera, "640x480".parse().unwrap()).unwrap();
         let p_cam = DVec3::new(0.3, -0.2, 2.0);

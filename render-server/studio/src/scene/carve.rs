@@ -1,4 +1,4 @@
-//! `vizflyt scene carve`: what the capture of a scene has proven to be free, written beside the scene.
+//! `vizflyt scene carve`: determines from the photos of a capture which space is free, and writes it next to the scene.
 
 use std::path::{Path, PathBuf};
 
@@ -17,49 +17,51 @@ use vizflyt_twin::Dataset;
 use vizflyt_twin::align::Similarity;
 use vizflyt_twin::carve::{CarveCounts, CarveOptions, Voxels, carve};
 
-/// Carves a scene by its capture: prunes floaters, and makes all that no photo has looked through solid.
+/// Carve a scene with the photos of its capture
+///
+/// Space that photos look through is free; everything else is solid. Floaters are removed.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt scene carve my-hall --capture my-capture
   vizflyt scene carve my-hall --capture my-capture --no-prune --report carve.json
 
---capture is what the scene was trained from, in the scene file's own frame: a folder of COLMAP, or of nerfstudio
-(transforms.json). The scene must lie where it shall (vizflyt scene align) before it is carved.")]
+--capture is the dataset from which the scene was trained, in the frame of the scene file: a folder of COLMAP, or of
+nerfstudio (transforms.json). Align the scene (vizflyt scene align) before you carve it.")]
 pub(crate) struct CarveArgs {
-    /// An arena around a scene file, as `vizflyt arena new` makes one
+    /// Arena with a scene file, as made by `vizflyt arena new`
     pub(crate) arena: PathBuf,
-    /// The photos and their poses that the scene was trained from
+    /// Photos with poses from which the scene was trained
     #[arg(long, value_name = "DATASET")]
     pub(crate) capture: PathBuf,
-    /// Width that wider photos are made smaller to [px]
+    /// Maximum image width; wider photos are downscaled [px]
     #[arg(long, default_value_t = 320, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     pub(crate) width: u32,
-    /// So many photos must have looked through a voxel
+    /// Minimum number of photos that must look through a free voxel
     #[arg(long, default_value_t = 2, value_name = "N", value_parser = clap::value_parser!(u8).range(1..))]
     pub(crate) photos: u8,
-    /// Around the camera, wherever it was, nothing stands [m]
+    /// Radius around each camera position that is assumed free [m]
     #[arg(long, default_value_t = 0.1, value_name = "METRES", value_parser = radius)]
     pub(crate) camera_radius: f64,
-    /// Leaves the scene's splats as they are: only writes what was seen
+    /// Keep all splats; only write the free space
     #[arg(long)]
     pub(crate) no_prune: bool,
-    /// Writes what was done as JSON
+    /// File for the results, as JSON
     #[arg(long, value_name = "FILE.json")]
     pub(crate) report: Option<PathBuf>,
 }
 
-/// What `--report` holds.
+/// Output of `--report`.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct CarveReport {
     scene: String,
     splats_before: usize,
     splats: usize,
-    /// Voxels with splats in them, before and after.
+    /// Number of voxels that contain splats, before and after.
     occupied_before: usize,
     occupied: usize,
-    /// Free of splats, but not seen to be: solid to the referee.
+    /// Number of voxels without splats that were not seen to be free; they are solid for the referee.
     unseen: usize,
-    /// Share of the fence's voxels from the floor up that were seen, 0 to 1.
+    /// Share of the fence's voxels above the floor that were seen, 0 to 1.
     seen_of_fence: f64,
     #[serde(flatten)]
     counts: CarveCounts,
@@ -69,7 +71,7 @@ pub(crate) struct CarveReport {
 pub(crate) fn run(args: &CarveArgs) -> Result<()> {
     let report = carve_arena(args)?;
     print_fmt!(
-        "pruned      {} of {} splats: {} looked through, {} on the camera's way, {} that no photo shows",
+        "pruned      {} of {} splats: {} looked through, {} on the camera's path, {} that no photo shows",
         report.splats_before - report.splats,
         report.splats_before,
         report.counts.looked_through,
@@ -89,7 +91,7 @@ pub(crate) fn run(args: &CarveArgs) -> Result<()> {
     );
     if report.counts.points > 0 {
         print_fmt!(
-            "points      {:.1} % of what structure from motion saw is hidden in the twin",
+            "points      {:.1} % of the points of structure from motion are hidden in the twin",
             100.0 * report.counts.hidden_points as f64 / report.counts.points as f64
         );
     }
@@ -103,14 +105,14 @@ pub(crate) fn run(args: &CarveArgs) -> Result<()> {
     Ok(())
 }
 
-/// Carves an arena's scene: writes the scene, what was seen of it, and `[occupancy]`.
+/// Carves the scene of an arena: writes the scene, the seen space, and `[occupancy]`.
 pub(crate) fn carve_arena(args: &CarveArgs) -> Result<CarveReport> {
     let file = if args.arena.is_dir() { args.arena.join("arena.toml") } else { args.arena.clone() };
     let is_arena = file.extension().is_some_and(|extension| extension == "toml") && file.is_file();
     let path = args.arena.display();
     ensure!(
         is_arena,
-        "{path} is no arena; make one around the scene: vizflyt arena new FOLDER --scene {path}"
+        "{path} is not an arena; create one for the scene: vizflyt arena new FOLDER --scene {path}"
     );
     let text = std::fs::read_to_string(&file)
         .with_context(|| format!("cannot read {}", file.display()))?;
@@ -143,7 +145,7 @@ pub(crate) fn carve_arena(args: &CarveArgs) -> Result<CarveReport> {
     let mut carved = carve(&dataset, &splats, &world_from_scene, voxels, &options);
     ensure!(
         carved.counts.seen > 0,
-        "no photo of {} looks into the fence of {}; is the scene trained from it, and does it lie where it shall \
+        "no photo of {} looks into the fence of {}; was the scene trained from it, and is it aligned \
          (vizflyt scene align)?",
         args.capture.display(),
         file.display()
@@ -156,7 +158,7 @@ pub(crate) fn carve_arena(args: &CarveArgs) -> Result<CarveReport> {
     let changed = carved.splats.len() != splats.len();
     ensure!(
         !carved.splats.is_empty(),
-        "nothing of {} stands where {} looks; is the scene trained from it?",
+        "no splat of {} is in the view of {}; was the scene trained from it?",
         scene.display(),
         args.capture.display()
     );
@@ -193,7 +195,7 @@ pub(crate) fn carve_arena(args: &CarveArgs) -> Result<CarveReport> {
     })
 }
 
-/// Returns the share of the fence's voxels, from the floor up, that was seen.
+/// Returns the share of the fence's voxels above the floor that was seen.
 fn seen_of_fence(Seen { space, place }: &Seen, arena: &ArenaConfig) -> f64 {
     let (seen, grid, fence) = (space.at(place), space.grid(), &arena.geofence);
     let [nx, ny, nz] = grid.size;
@@ -208,7 +210,7 @@ fn seen_of_fence(Seen { space, place }: &Seen, arena: &ArenaConfig) -> f64 {
     of_them as f64 / inside.max(1) as f64
 }
 
-/// Keeps the scene as it was before it was carved for the first time: `hall.uncarved.ply`.
+/// Copies the scene before it is carved for the first time: `hall.uncarved.ply`.
 fn keep_first(scene: &Path) -> Result<()> {
     let stem = scene.file_stem().unwrap_or_default().to_string_lossy();
     let extension = scene.extension().unwrap_or_default().to_string_lossy();
@@ -216,12 +218,12 @@ fn keep_first(scene: &Path) -> Result<()> {
     if !kept.exists() {
         std::fs::copy(scene, &kept)
             .with_context(|| format!("cannot keep {} at {}", scene.display(), kept.display()))?;
-        print_fmt!("kept        {} as it was", kept.display());
+        print_fmt!("copied      the original to {}", kept.display());
     }
     Ok(())
 }
 
-/// Returns the text of an arena.toml to which unseen space is solid; all else stays, comments too.
+/// Sets `unseen = "solid"` in the text of an arena.toml; all other text and comments stay.
 fn with_unseen_solid(text: &str) -> Result<String> {
     let mut document: DocumentMut = text.parse()?;
     if document.get("occupancy").is_none() {
@@ -234,7 +236,7 @@ fn with_unseen_solid(text: &str) -> Result<String> {
 fn radius(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(metres) if (0.0..=2.0).contains(&metres) => Ok(metres),
-        _ => Err(format!("'{text}' is no radius of 0 to 2 m")),
+        _ => Err(format!("'{text}' is not a radius of 0 to 2 m")),
     }
 }
 
@@ -243,7 +245,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn unseen_becomes_solid_and_all_else_stays() {
+    fn only_the_key_unseen_changes() {
         for (text, expected) in [
             (
                 "a = 1 # one\n\n[b]\nc = 2\n",

@@ -1,4 +1,4 @@
-//! `vizflyt scene convert`: a scene of any format in any other, turned and scaled on the way.
+//! `vizflyt scene convert`: converts a scene to another format, with optional rotation and scale.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -11,7 +11,9 @@ use vizflyt_process::{print_fmt, print_line};
 use vizflyt_server::scene::{WorldFromScene, parse_scale};
 use vizflyt_splat::format::{self, Format, Progress};
 
-/// Converts a scene file to another format; the files' names decide, and content where it has a mark.
+/// Convert a scene file to another format
+///
+/// File names determine the formats; for input files with a magic number, the content does.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt scene convert scene.spz scene.ply
@@ -19,20 +21,22 @@ use vizflyt_splat::format::{self, Format, Progress};
   vizflyt scene convert room.ply upright.ply --up -y --rotate 0,0,90 --scale 0.176
   vizflyt scene convert streamed/lod-meta.json coarse.ply --level 2")]
 pub(crate) struct ConvertArgs {
-    /// The scene: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat, .glb, .gltf, or the folder of a SOG
+    /// Scene: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat, .glb, .gltf
+    ///
+    /// Or the folder of a SOG.
     from: PathBuf,
-    /// The file to write; a `meta.json` becomes a SOG scene of separate files
+    /// File to write; `meta.json` writes a SOG scene of separate files
     to: PathBuf,
     /// Version of SPZ, or level of KSPLAT, to write
     #[arg(long, value_name = "N")]
     variant: Option<u32>,
-    /// Turns the scene so that this axis becomes +z: x, -x, y, -y, z or -z
+    /// Rotate the scene so that this axis becomes +z: x, -x, y, -y, z or -z
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     up: Option<Up>,
-    /// Then turns it about x, then y, then z, counter-clockwise [deg]
+    /// Then rotate it about x, then y, then z, counter-clockwise [deg]
     #[arg(long, value_name = "X,Y,Z", value_parser = degrees, allow_hyphen_values = true)]
     rotate: Option<DVec3>,
-    /// Makes it larger by this factor: metres per unit make it metric
+    /// Scale the scene by this factor: metres per unit make it metric
     #[arg(long, value_name = "FACTOR", value_parser = parse_scale)]
     scale: Option<f64>,
     /// Level of a streamed scene (lod-meta.json) to read; 0 is the finest
@@ -62,7 +66,7 @@ fn degrees(text: &str) -> Result<DVec3, String> {
     }
 }
 
-/// Converts.
+/// Runs `vizflyt scene convert`.
 pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
     let start = Instant::now();
     let mut shown_s = 1;
@@ -86,13 +90,13 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
         start.elapsed().as_secs_f64() * 1e3
     );
     for skipped in loaded.skipped_properties.iter().chain(&loaded.skipped_elements) {
-        print_fmt!("left out: {skipped}");
+        print_fmt!("skipped: {skipped}");
     }
     args.world_from_scene().apply(&mut loaded.splats);
     let to = Format::of_name(&args.to);
     if loaded.splats.antialiased && to.is_some_and(|format| !format.keeps_antialiased()) {
         print_line(
-            "trained with anti-aliasing, which no file of this format says: render with --antialiased on",
+            "trained with anti-aliasing, which this format cannot store: render with --antialiased on",
         );
     }
     match (args.variant, to) {
@@ -124,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_is_turned_upright_then_about_its_axes_then_scaled() {
+    fn applies_up_then_rotation_then_scale() {
         let check = |options: &str, p: DVec3, expected: DVec3| {
             let found = moved(options, p);
             assert!((found - expected).length() < 1e-9, "{options}: {found}");
@@ -132,14 +136,14 @@ mod tests {
         check("", DVec3::new(1.0, 2.0, 3.0), DVec3::new(1.0, 2.0, 3.0));
         check("--up -y --scale 2", DVec3::NEG_Y, DVec3::Z * 2.0);
         check("--rotate 0,0,90", DVec3::X, DVec3::Y);
-        // About x first: y becomes z, and stays there about z.
+        // The rotation about x comes first: y becomes z, which the rotation about z keeps.
         check("--rotate 90,0,90", DVec3::Y, DVec3::Z);
         check("--rotate -90,0,0", DVec3::Y, DVec3::NEG_Z);
         check("--up -y --rotate 0,0,90", DVec3::Z, DVec3::Y);
     }
 
     #[test]
-    fn what_is_no_turn_is_refused() {
+    fn rejects_invalid_rotations() {
         for wrong in ["90", "0,0", "0,0,x", "0,0,0,0", "0,0,400", "0,0,nan", ""] {
             assert!(degrees(wrong).unwrap_err().contains("0,0,90"), "{wrong}");
         }

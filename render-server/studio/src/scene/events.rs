@@ -1,4 +1,4 @@
-//! `vizflyt scene events`: what an event camera reports along a path through an arena.
+//! `vizflyt scene events`: simulates the events of an event camera along a path through an arena.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -17,7 +17,7 @@ use vizflyt_splat::{Camera, Chosen, RgbdImage, Scene};
 
 use crate::evaluate;
 
-/// Renders a path densely and writes the events of its changes.
+/// Simulate an event camera on a path
 #[derive(Args, Debug)]
 #[command(
     after_help = "The model is ESIM's: a pixel reports each time that the logarithm of its brightness has changed by
@@ -31,47 +31,47 @@ Examples:
   vizflyt scene events race/arena.toml --path track.tum --camera rear --rate 2000 --contrast 0.15 -o e.txt"
 )]
 pub(crate) struct EventsArgs {
-    /// An arena.toml: its scene, its cameras
+    /// arena.toml with scene and cameras
     arena: PathBuf,
-    /// Poses of the vehicle's body: TUM's text, EuRoC's CSV or FLIGHT.mcap#TOPIC
+    /// Poses of the vehicle's body: TUM text, EuRoC CSV or FLIGHT.mcap#TOPIC
     #[arg(long, value_name = "PATH")]
     path: String,
-    /// Which of the arena's cameras; the first one without
+    /// Camera of the arena [default: the first one]
     #[arg(long, value_name = "NAME")]
     camera: Option<String>,
-    /// Images a second that changes are found between; so many that little moves by more than a pixel
+    /// Rate of rendered images; motion between two should be less than a pixel
     #[arg(long, value_name = "HZ", default_value_t = 1000.0, value_parser = rate)]
     rate: f64,
-    /// Change of the natural logarithm of a pixel's brightness that is an event
+    /// Change of the natural logarithm of a pixel's brightness that causes an event
     #[arg(long, value_name = "LN", default_value_t = 0.2, value_parser = contrast)]
     contrast: f32,
-    /// After an event a pixel is silent for so long
+    /// Dead time of a pixel after an event
     #[arg(long, value_name = "MICROSECONDS", default_value_t = 0)]
     dead: u32,
-    /// Leaves out the path before this instant
+    /// Start time on the path
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
     from: f64,
-    /// How much of the path
+    /// Duration on the path [default: to the end]
     #[arg(long, value_name = "SECONDS")]
     seconds: Option<f64>,
-    /// Seed for the initial phase of objects that set none
+    /// Seed of the initial phase of objects that set none
     #[arg(long, default_value_t = 7)]
     seed: u64,
-    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
+    /// Renderer: usable graphics card, processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
-    /// Where to write
+    /// File to write
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
 }
 
 fn rate(text: &str) -> Result<f64, String> {
-    let hz: f64 = text.parse().map_err(|_| format!("'{text}' is no rate"))?;
+    let hz: f64 = text.parse().map_err(|_| format!("'{text}' is not a rate"))?;
     (1.0..=1e6).contains(&hz).then_some(hz).ok_or_else(|| "give 1 to 1000000 Hz".to_owned())
 }
 
 fn contrast(text: &str) -> Result<f32, String> {
-    let ln: f32 = text.parse().map_err(|_| format!("'{text}' is no contrast"))?;
+    let ln: f32 = text.parse().map_err(|_| format!("'{text}' is not a contrast"))?;
     (0.01..=5.0).contains(&ln).then_some(ln).ok_or_else(|| "give 0.01 to 5".to_owned())
 }
 
@@ -93,7 +93,7 @@ pub(super) fn run(args: &EventsArgs) -> Result<()> {
     let span_s = (last_s - first_s - args.from).min(args.seconds.unwrap_or(f64::INFINITY));
     ensure!(
         args.from >= 0.0 && span_s > 0.0,
-        "the path is {:.3} s long: nothing of it is left from {} s on",
+        "the path is {:.3} s long: --from {} s is after its end",
         last_s - first_s,
         args.from
     );
@@ -170,10 +170,10 @@ position_m = [0, 0, 0]
 "#;
 
     #[test]
-    fn a_ball_that_passes_makes_events_at_both_of_its_sides() {
+    fn a_passing_ball_causes_events_at_both_edges() {
         let folder = tempfile::tempdir().unwrap();
         let file = |name: &str| folder.path().join(name);
-        // A white ball 2 m ahead of where the vehicle is halfway.
+        // A white ball, 2 m in front of the middle of the path.
         let ball = Splats {
             means_m: vec![Vec3::new(2.0, 0.0, 1.0)],
             scales_m: vec![Vec3::splat(0.1)],
@@ -185,7 +185,7 @@ position_m = [0, 0, 0]
         };
         vizflyt_splat::format::write(file("ball.ply"), &ball).unwrap();
         std::fs::write(file("arena.toml"), ARENA).unwrap();
-        // To the left, half a metre in half a second.
+        // The vehicle moves 0.5 m to the left in 0.5 s.
         std::fs::write(file("path.tum"), "5.0 0 -0.25 1 0 0 0 1\n5.5 0 0.25 1 0 0 0 1\n").unwrap();
         let mut args = EventsArgs {
             arena: file("arena.toml"),
@@ -208,7 +208,7 @@ position_m = [0, 0, 0]
             .collect();
         assert!(events.len() > 100, "{}", events.len());
         assert!(events.is_sorted_by(|a, b| a[0] <= b[0]) && events[events.len() - 1][0] <= 0.5);
-        // It moves to the right in the image: brighter there, darker on the left, at each instant.
+        // The ball moves to the right in the image: pixels at its right edge get brighter, at its left edge darker.
         let mean_x = |on: f64| {
             let of = events.iter().filter(|event| event[3] == on && (0.2..0.3).contains(&event[0]));
             let (sum, count) =
@@ -221,7 +221,7 @@ position_m = [0, 0, 0]
         args.from = 0.6;
         args.camera = None;
         assert!(
-            run(&args).unwrap_err().to_string().contains("nothing of it is left from 0.6 s on")
+            run(&args).unwrap_err().to_string().contains("--from 0.6 s is after its end")
         );
     }
 }

@@ -1,4 +1,4 @@
-//! `vizflyt scene generate`: a scene with known geometry, and what a phone films on a walk through it.
+//! `vizflyt scene generate`: generates a scene with known geometry, and a phone's video of a walk through it.
 
 mod film;
 mod sink;
@@ -16,13 +16,13 @@ use vizflyt_scenes::{FilmSet, Generated, SceneKind, film_set};
 
 use super::camera::ImageSize;
 
-/// Generates a scene with known geometry: scene.ply, arena.toml, truth.json.
+/// Generate a scene with known geometry: scene.ply, arena.toml, truth.json
 #[derive(Args, Debug)]
 #[command(
-    after_help = "A capture is a walk through the scene as a phone films it: a lens, rolling shutter, automatic exposure,
-motion blur, noise. Beside hall.mp4 come hall.truth.json (where the camera truly was), hall.camera.toml
-(its lens) and, with --tags, hall.tags.toml (where the tags stand); in a folder they have no 'hall.'.
-A video is encoded by the program ffmpeg; a folder of images needs none.
+    after_help = "A capture is a phone's video of a walk through the scene: lens, rolling shutter, automatic exposure, motion
+blur, noise. Next to hall.mp4 it writes hall.truth.json (true camera poses), hall.camera.toml (lens) and,
+with --tags, hall.tags.toml (layout of the tags); in a folder, the names lack 'hall.'.
+Videos require the program ffmpeg; a folder of images does not.
 
 Examples:
   vizflyt scene generate forest --seed 7 -o my-forest
@@ -33,31 +33,33 @@ Examples:
 pub(crate) struct GenerateArgs {
     #[arg(help = format!("What to generate: {}", SceneKind::names()))]
     kind: SceneKind,
-    /// Same seed, same scene, same walk, same phone
+    /// Seed of scene, walk and phone
     #[arg(long, default_value_t = 7)]
     seed: u64,
-    /// Folder to write the scene to; made if absent
+    /// Output folder of the scene; created if missing
     #[arg(short, long, value_name = "DIR", required_unless_present = "capture")]
     output: Option<PathBuf>,
-    /// Films a walk through it: a video (.mp4, .mkv, .mov), or a folder of JPEG images
+    /// Video (.mp4, .mkv, .mov) or folder of JPEG images of a walk through the scene
     #[arg(long, value_name = "FILE|DIR")]
     capture: Option<PathBuf>,
-    /// Puts up boards with printed AprilTags along the walk; they stand in the scene of --output, too
+    /// Put boards with AprilTags along the walk, also into the scene of --output
     #[arg(long, requires = "capture")]
     tags: bool,
-    /// How long the walk takes, which ends where it began
+    /// Duration of the walk, which ends at its start
     #[arg(long, value_name = "S", requires = "capture", default_value_t = 50.0)]
     seconds: f64,
-    /// How many images: of a folder, evenly over the walk (80 unless given); of a video, its first ones
+    /// Number of images
+    ///
+    /// Of a folder: evenly spaced over the walk, 80 by default. Of a video: the first ones.
     #[arg(long, value_name = "N", requires = "capture")]
     frames: Option<u32>,
-    /// Size of the images
+    /// Image size
     #[arg(long, value_name = "WxH", requires = "capture", default_value = "640x480")]
     size: ImageSize,
-    /// What moves in the scene moves while it is filmed, by its clock; without, it stands still
+    /// Animate moving objects during the walk; without this option they stand still
     #[arg(long, requires = "capture")]
     moving: bool,
-    /// Replaces what is already there
+    /// Replace existing files
     #[arg(long)]
     force: bool,
 }
@@ -105,7 +107,7 @@ pub(super) fn run(args: &GenerateArgs) -> Result<()> {
 
 fn refuse_existing(path: &Path, force: bool) -> Result<()> {
     if path.exists() && !force {
-        bail!("{} is there already; give another name, or --force to replace it", path.display());
+        bail!("{} already exists; give another name, or --force to replace it", path.display());
     }
     Ok(())
 }

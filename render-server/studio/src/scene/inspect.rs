@@ -1,4 +1,4 @@
-//! `vizflyt scene inspect`: what a scene file holds, and what looks wrong with it.
+//! `vizflyt scene inspect`: prints the content of a scene file, and warnings about possible problems.
 
 use std::path::{Path, PathBuf};
 
@@ -11,7 +11,7 @@ use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::Splats;
 use vizflyt_splat::format::Loaded;
 
-/// Reports what a scene holds, and what looks wrong with it.
+/// Print the content of a scene, and possible problems
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt scene inspect room.ply
@@ -19,12 +19,12 @@ use vizflyt_splat::format::Loaded;
 pub(crate) struct InspectArgs {
     /// Scene file of any format, or an arena.toml (then its scene)
     scene: PathBuf,
-    /// Prints one JSON object
+    /// Print one JSON object
     #[arg(long)]
     json: bool,
 }
 
-/// What `--json` prints.
+/// Output of `--json`.
 #[derive(Debug, Serialize)]
 struct Inspection {
     file: String,
@@ -33,16 +33,16 @@ struct Inspection {
     splats: usize,
     dropped: usize,
     sh_degree: u8,
-    /// Whether the file says that the scene was trained with anti-aliasing.
+    /// Whether the scene was trained with anti-aliasing, according to its file.
     antialiased: bool,
-    /// Decoded, as loaded. [MB]
+    /// Memory of the loaded scene. [MB]
     memory_mb: f64,
-    /// Least and greatest centre. [scene]
+    /// Minimum and maximum of the centres. [scene]
     bounds: [[f32; 3]; 2],
     /// 2nd and 98th percentile of centres of splats at least half opaque. [scene]
     core_bounds: [[f32; 3]; 2],
     opacity: Quantiles,
-    /// Greatest of a splat's three standard deviations. [scene]
+    /// Largest of the three standard deviations of each splat. [scene]
     scale: Quantiles,
     warnings: Vec<String>,
 }
@@ -145,7 +145,7 @@ fn inspect(path: &Path, loaded: &Loaded) -> Inspection {
     }
 }
 
-/// Returns the size of a file, or of all files right in a folder. [bytes]
+/// Returns the size of a file, or of all files directly in a folder. [bytes]
 fn bytes_on_disk(path: &Path) -> u64 {
     let size = |path: &Path| std::fs::metadata(path).map_or(0, |data| data.len());
     match std::fs::read_dir(path) {
@@ -162,7 +162,7 @@ fn memory_bytes(splats: &Splats) -> usize {
         + size_of_val(&splats.sh[..])
 }
 
-/// Returns the corners of a box around all points but a share at either end of each axis.
+/// Returns the corners of a box around all points, without a share `edge` at both ends of each axis.
 fn bounds(points: impl Iterator<Item = Vec3>, edge: f64) -> [Vec3; 2] {
     let mut points: Vec<Vec3> = points.collect();
     let mut corners = [Vec3::ZERO; 2];
@@ -184,18 +184,18 @@ fn warnings_of_file(loaded: &Loaded) -> Vec<String> {
     for (count, what) in [
         (dropped.non_finite, "hold numbers that are not finite: the training diverged there"),
         (dropped.zero_rotation, "have no rotation (a zero quaternion)"),
-        (dropped.scale_overflow, "are of a size beyond any number"),
+        (dropped.scale_overflow, "have an infinite size"),
     ] {
         if count > 0 {
-            warnings.push(format!("{count} splats {what}; they are left out"));
+            warnings.push(format!("{count} splats {what}; they are skipped"));
         }
     }
-    // Trainers write normals that are all zero.
+    // Trainers write normals of zero, which need no warning.
     let is_normal = |name: &&String| ["nx", "ny", "nz"].contains(&name.as_str());
     let names: Vec<_> = loaded.skipped_properties.iter().filter(|name| !is_normal(name)).collect();
     if !names.is_empty() {
         let names = names.iter().map(|name| name.as_str()).collect::<Vec<_>>().join(", ");
-        warnings.push(format!("properties that no splat needs are ignored: {names}"));
+        warnings.push(format!("unused properties are ignored: {names}"));
     }
     warnings
 }
@@ -208,7 +208,7 @@ fn warnings_of_splats(splats: &Splats, [low, high]: [Vec3; 2]) -> Vec<String> {
     let opaque = splats.opacities.iter().filter(|&&opacity| opacity >= 0.5).count();
     if visible == 0 {
         warnings.push(
-            "every splat is fully transparent: nothing will be seen; was the opacity exported \
+            "every splat is fully transparent: images will be empty; was the opacity exported \
              without its logit?"
                 .to_owned(),
         );
@@ -266,11 +266,11 @@ fn warnings_of_splats(splats: &Splats, [low, high]: [Vec3; 2]) -> Vec<String> {
     warnings
 }
 
-/// Share of splats outside the core at either end.
+/// Share of splats outside the core at each end of an axis.
 const EDGE: f64 = 0.02;
-/// Trained scenes have few beyond.
+/// Minimum ratio of length to width of a needle; trained scenes have few.
 const NEEDLE: f32 = 50.0;
-/// A table top, and a campus. [m]
+/// Plausible range of a scene's size: from a table top to a campus. [m]
 const MIN_EXTENT: f32 = 1.0;
 const MAX_EXTENT: f32 = 500.0;
 
@@ -280,7 +280,7 @@ mod tests {
 
     use super::*;
 
-    /// A hundred balls on a line of 10 m.
+    /// Returns 101 balls on a line of 10 m.
     fn balls() -> Splats {
         let count = 101;
         Splats {
@@ -302,12 +302,12 @@ mod tests {
     }
 
     #[test]
-    fn a_good_scene_has_no_warnings() {
+    fn gives_no_warnings_for_a_good_scene() {
         assert_eq!(warnings(|_| ()), "");
     }
 
     #[test]
-    fn faults_are_reported() {
+    fn warns_about_each_fault() {
         let check = |change: fn(&mut Splats), expected: &str| {
             let found = warnings(change);
             assert!(found.contains(expected), "'{found}' lacks '{expected}'");
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_are_those_of_the_values() {
+    fn computes_quantiles() {
         let found = Quantiles::of((0..=100).rev().map(|k| k as f32).collect());
         assert_eq!(
             (found.min, found.p01, found.p50, found.p99, found.max),

@@ -1,4 +1,4 @@
-//! `vizflyt scene`: makes, captures, trains, edits, bakes, inspects, packs and renders scenes.
+//! `vizflyt scene`: creates, captures, trains, edits, bakes, inspects, packs and renders scenes.
 
 mod align;
 mod bake;
@@ -24,7 +24,7 @@ pub use render::MEMORY_MIB;
 
 use crate::page::show_page;
 
-/// Makes, trains, edits, bakes, inspects, packs and renders scenes.
+/// Make, train, edit, bake, inspect, pack and render scenes
 #[derive(Args, Debug)]
 pub struct SceneArgs {
     #[command(subcommand)]
@@ -39,7 +39,7 @@ enum SceneCommand {
     Capture(capture::CaptureArgs),
     Carve(carve::CarveArgs),
     Convert(convert::ConvertArgs),
-    // Boxed: it has a flag for every kind of step.
+    // Boxed because it is large: it has an option for every kind of step.
     Edit(Box<edit::EditArgs>),
     Events(events::EventsArgs),
     Inspect(inspect::InspectArgs),

@@ -1,4 +1,4 @@
-//! Writes arrays that `numpy.load` reads: the .npy format, version 1.0, little-endian, C order
+//! Writes arrays for `numpy.load`: .npy format, version 1.0, little-endian, C order
 //! (numpy.org/doc/stable/reference/generated/numpy.lib.format.html).
 
 use std::io::{self, Write};
@@ -6,12 +6,12 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 
-/// A number as .npy files hold it.
+/// Element type of an array.
 pub(crate) trait Element: Copy {
-    /// numpy's name of the type: byte order, kind, bytes.
+    /// Type string of numpy: byte order, kind, bytes.
     const DESCRIPTION: &'static str;
 
-    /// Writes it, least significant byte first.
+    /// Writes the value in little-endian order.
     fn write(self, out: &mut impl Write) -> io::Result<()>;
 }
 
@@ -31,7 +31,7 @@ impl Element for u16 {
     }
 }
 
-/// Writes `values`, row-major, as an array of this shape to a file.
+/// Writes `values` (row-major) as an array of this shape to a file.
 pub(crate) fn save<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> Result<()> {
     let write = || {
         let mut out = io::BufWriter::new(std::fs::File::create(path)?);
@@ -42,17 +42,17 @@ pub(crate) fn save<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> Re
 }
 
 /// # Panics
-/// If there are not as many values as the shape has places.
+/// The number of values does not match the shape.
 fn write<T: Element>(out: &mut impl Write, shape: &[usize], values: &[T]) -> io::Result<()> {
     assert_eq!(shape.iter().product::<usize>(), values.len(), "one value per place");
-    // A tuple as Python writes it: (4,) and (2, 3).
+    // Tuple in Python's notation: (4,) or (2, 3).
     let sides: Vec<String> = shape.iter().map(ToString::to_string).collect();
     let comma = if shape.len() == 1 { "," } else { "" };
     let sides = sides.join(", ") + comma;
     let description = T::DESCRIPTION;
     let mut head =
         format!("{{'descr': '{description}', 'fortran_order': False, 'shape': ({sides}), }}");
-    // Padded so that the values begin at a multiple of 64 bytes, and ended by a line feed.
+    // The header is padded so that the values begin at a multiple of 64 bytes. It ends with a line feed.
     let length = (MAGIC.len() + 2 + head.len() + 1).next_multiple_of(64) - MAGIC.len() - 2;
     head.extend(std::iter::repeat_n(' ', length - 1 - head.len()));
     head.push('\n');
@@ -75,9 +75,9 @@ mod tests {
         out
     }
 
-    /// What numpy 2.3 writes for `np.save(f, np.array([[1, 2, 3], [4, 5, 6]], '<u2'))`.
+    /// Expected: output of numpy 2.3 for `np.save(f, np.array([[1, 2, 3], [4, 5, 6]], '<u2'))`.
     #[test]
-    fn the_bytes_are_numpys_own() {
+    fn writes_the_same_bytes_as_numpy() {
         let found = bytes(&[2, 3], &[1u16, 2, 3, 4, 5, 6]);
         let head = "{'descr': '<u2', 'fortran_order': False, 'shape': (2, 3), }";
         let mut expected = b"\x93NUMPY\x01\x00\x76\x00".to_vec();
@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn shapes_are_tuples_and_values_are_aligned() {
+    fn writes_shapes_as_tuples_and_aligns_values() {
         for (shape, text) in
             [(vec![4], "(4,)"), (vec![2, 2], "(2, 2)"), (vec![1, 2, 2], "(1, 2, 2)")]
         {

@@ -1,4 +1,4 @@
-//! `vizflyt scene pack`: a scene as a file that is rendered without being read whole.
+//! `vizflyt scene pack`: writes a packed scene, which is rendered block by block from the disk.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -9,14 +9,16 @@ use vizflyt_process::print_fmt;
 use vizflyt_server::scene::placed;
 use vizflyt_splat::{Detail, pack};
 
-/// Packs a scene larger than memory for rendering from the disk, in adaptive detail.
+/// Pack a scene larger than memory, to render it from the disk
+///
+/// Packed scenes are rendered with adaptive detail.
 #[derive(Args, Debug)]
 #[command(
-    after_help = "A streamed scene (lod-meta.json) is read chunk by chunk, so that packing takes the memory of the \
-largest; any other is read whole. The file takes some 80 bytes a splat without harmonics, 200 with all of them. `scene \
-render` and `bench render` draw it within --memory. An arena.toml that names it (scene = \"city.packed\") is flown in; it lies \
-where it was packed, in metres of the world: give the arena.toml of the scene itself where [scene] places it. The other \
-scene commands, and graded flights, take the scene that it was packed of, not this.
+    after_help = "A streamed scene (lod-meta.json) is read chunk by chunk, so that packing needs the memory of its \
+largest chunk; any other scene is read at once. The file has about 80 bytes per splat without harmonics, 200 with all of \
+them. `scene render` and `bench render` render it within --memory. For flights, name it in an arena.toml (scene = \
+\"city.packed\"). A packed scene is in metres of the world: if the original has a [scene] placement, pack its arena.toml. \
+The other scene commands, and graded flights, need the original scene.
 
 Examples:
   vizflyt scene pack city/lod-meta.json city.packed
@@ -24,14 +26,15 @@ Examples:
   vizflyt scene render city.packed --camera cam.json --memory 1024"
 )]
 pub(crate) struct PackArgs {
-    /// The scene: of any format, or a streamed SOG (lod-meta.json, or its folder), of which the finest level is taken; or an
-    /// arena.toml, which places its scene
+    /// Scene of any format, streamed SOG, or an arena.toml, which places its scene
+    ///
+    /// Of a streamed SOG (lod-meta.json, or its folder), the finest level is packed.
     from: PathBuf,
-    /// The file to write
+    /// File to write
     to: PathBuf,
 }
 
-/// Packs.
+/// Runs `vizflyt scene pack`.
 pub(super) fn run(args: &PackArgs) -> Result<()> {
     let start = Instant::now();
     let mut shown_s = 0;

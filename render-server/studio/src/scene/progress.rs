@@ -1,10 +1,9 @@
-//! What is done and how long the rest takes, on standard error: a line that changes where people watch, else one every
-//! half minute.
+//! Progress and remaining time on standard error: one line that is updated on a terminal, otherwise a line every 30 s.
 
 use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
 
-/// The progress of one piece of work.
+/// Progress of a job.
 #[derive(Debug)]
 pub(super) struct Progress {
     title: String,
@@ -13,12 +12,12 @@ pub(super) struct Progress {
 }
 
 impl Progress {
-    /// Begins now; every line begins with the title.
+    /// Starts now. Every line begins with the title.
     pub(super) fn new(title: impl Into<String>) -> Self {
         Self { title: title.into(), start: Instant::now(), next: Duration::ZERO }
     }
 
-    /// Shows what is done, and how long the rest takes if it goes on like this; `share` is of 1.
+    /// Shows the progress and the estimated remaining time; `share` is from 0 to 1.
     pub(super) fn show(&mut self, share: f64, what: impl FnOnce() -> String) {
         let elapsed = self.start.elapsed();
         if elapsed < self.next {
@@ -28,7 +27,7 @@ impl Progress {
         let watched = stderr.is_terminal();
         self.next = elapsed + Duration::from_millis(if watched { 250 } else { 30_000 });
         let line = format!("{}{}{}", self.title, what(), left(elapsed, share));
-        // A terminal that is gone is no reason to stop.
+        // A closed terminal must not stop the job.
         let _ = if watched {
             write!(stderr, "\r{line:<78}").and_then(|()| stderr.flush())
         } else {
@@ -46,7 +45,7 @@ impl Drop for Progress {
     }
 }
 
-/// Returns how long the rest takes, in words; nothing before that can be known.
+/// Returns the text of the estimated remaining time; empty as long as it cannot be estimated.
 fn left(elapsed: Duration, share: f64) -> String {
     if !(share > 0.0 && share <= 1.0) || elapsed < SOON {
         return String::new();
@@ -55,7 +54,7 @@ fn left(elapsed: Duration, share: f64) -> String {
     format!(", {}:{:02} left", left_s / 60, left_s % 60)
 }
 
-/// What took less time says nothing of the rest.
+/// Minimum elapsed time for an estimate.
 const SOON: Duration = Duration::from_millis(500);
 
 #[cfg(test)]
@@ -63,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_rest_takes_as_long_as_what_was() {
+    fn extrapolates_the_remaining_time() {
         let ten = Duration::from_secs(10);
         assert_eq!(left(ten, 0.1), ", 1:30 left");
         assert_eq!(left(ten, 1.0), ", 0:00 left");

@@ -1,4 +1,4 @@
-//! `vizflyt scene render`: pictures of a scene from given cameras, as files.
+//! `vizflyt scene render`: renders images of a scene from given cameras to files.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -22,14 +22,14 @@ use vizflyt_splat::{
 use super::camera;
 use super::npy;
 
-/// Renders a scene as it is, from cameras in its own frame, to files.
+/// Render a scene to files, from cameras in its own frame
 #[derive(Args, Debug)]
 #[command(after_help = "CAM.json:
   {\"fx\": 251.1, \"fy\": 251.1, \"cx\": 160, \"cy\": 120, \"w\": 320, \"h\": 240, \"bg\": [0, 0, 0],
    \"w2c\": [[1,0,0,0], [0,1,0,0], [0,0,1,0], [0,0,0,1]]}
   w2c takes points of the scene file to the camera (x right, y down, z forward); pixel centres at
   +0.5. May also have near_m (0.01), and distortion {\"model\": \"brown-conrady\", \"k1\": ...} or
-  {\"model\": \"kannala-brandt\", ...}. `vizflyt scene view` copies one from where you have flown.
+  {\"model\": \"kannala-brandt\", ...}. `vizflyt scene view` copies one of the current view.
 
 Files:
   png   rgb.png; depth_mm.png (16 bit, millimetres, median, 0 is no return)
@@ -42,64 +42,70 @@ Examples:
   vizflyt scene render forest/arena.toml --camera a.json --camera b.json --format npy --out poses
   vizflyt scene render race/arena.toml --camera cam.json --at 2.5")]
 pub(crate) struct RenderArgs {
-    /// Scene file of any format, a packed one (`scene pack`), or an arena.toml (then its scene)
+    /// Scene file, packed scene (`scene pack`), or arena.toml (then its scene)
     scene: PathBuf,
-    /// The camera; given several times, each has a folder of its name in --out
+    /// Camera file; can be repeated
+    ///
+    /// With several cameras, each gets a folder of its name in --out.
     #[arg(long = "camera", value_name = "CAM.json", required = true)]
     cameras: Vec<PathBuf>,
-    /// Folder to write to; made if absent
+    /// Output folder; created if missing
     #[arg(long, value_name = "DIR", default_value = ".")]
     out: PathBuf,
-    /// png to look at, npy to compute with
+    /// File format: png for viewing, npy for computing
     #[arg(long, value_enum, default_value_t)]
     format: FileFormat,
     #[arg(long, value_name = "NAME", default_value_t, help = format!(
-        "The light and the weather it is seen in: {}", Variant::names()
+        "Light and weather: {}", Variant::names()
     ))]
     environment: Variant,
-    /// Instant at which moving objects and weather are rendered, since the arena's clock began
+    /// Time since the start of the arena's clock, for moving objects and weather
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]
     at: f64,
-    /// Seed for the initial phase of objects that set none, and for weather
+    /// Seed of weather, and of the initial phase of objects that set none
     #[arg(long, default_value_t = 7)]
     seed: u64,
-    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
+    /// Renderer: usable graphics card, processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
-    /// How much of a large scene is rendered; adaptive is as in flight
+    /// Level of detail for large scenes; flights use adaptive
     #[arg(long, value_enum, value_name = "HOW", default_value_t = DetailKind::Full)]
     detail: DetailKind,
-    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file
+    /// Whether the scene was trained with anti-aliasing (mip-splatting)
+    ///
+    /// auto: as in the arena, or else as in the scene's file.
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     antialiased: Antialiased,
-    /// Memory for the blocks of a packed scene, which is always rendered in adaptive detail [MiB]
+    /// Memory for the blocks of a packed scene [MiB]
+    ///
+    /// A packed scene is always rendered with adaptive detail.
     #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(1..))]
     memory: u32,
 }
 
-/// Of a packed scene's blocks in memory. [MiB]
+/// Default memory for the blocks of a packed scene. [MiB]
 pub const MEMORY_MIB: u32 = 1024;
 
 #[derive(Clone, Copy, Debug, Default, ValueEnum)]
 enum FileFormat {
-    /// 8-bit colour and 16-bit millimetres.
+    /// 8-bit colour and 16-bit depth in millimetres
     #[default]
     Png,
-    /// float32 arrays for numpy.
+    /// float32 arrays for numpy
     Npy,
 }
 
 /// Runs `vizflyt scene render`.
 pub(super) fn run(args: &RenderArgs) -> Result<()> {
-    // Cameras first: a mistake in one is reported before the scene is loaded.
+    // Cameras are read first, so that their errors are reported before the scene is loaded.
     let jobs = jobs(args)?;
     let environment = args.environment.environment();
     let is_metric =
         EnvironmentConfig { light: environment.light, ..EnvironmentConfig::CLEAR } != environment;
     if is_metric && !is_in_an_arena(&args.scene) {
         bail!(
-            "--environment {}: weather is in metres and comes from above, and {} says neither its unit nor \
-             its up; name the arena.toml that it belongs to (`vizflyt arena new` makes one)",
+            "--environment {}: weather needs metres and a vertical axis, which {} does not define; give the \
+             scene's arena.toml (`vizflyt arena new` creates one)",
             args.environment,
             args.scene.display()
         );
@@ -136,11 +142,11 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns what renders the scene, what moves in it, and when its preparation began.
+/// Returns the renderer, the moving objects, and the start time of the preparation.
 fn opened(args: &RenderArgs) -> Result<(Box<dyn Rasterizer>, MovingObjects, Instant)> {
     if PackedScene::is_packed(&args.scene) {
         if args.antialiased != Antialiased::default() {
-            bail!("--antialiased: a packed scene is rendered as the one that it was packed of");
+            bail!("--antialiased: a packed scene uses the setting of its original scene");
         }
         let start = Instant::now();
         let memory_bytes = args.memory as usize * (1 << 20);
@@ -167,11 +173,11 @@ fn opened(args: &RenderArgs) -> Result<(Box<dyn Rasterizer>, MovingObjects, Inst
     Ok((rasterizer, moving, start))
 }
 
-/// Within the range of a clock of nanoseconds.
+/// Parses a time within the range of a nanosecond clock.
 fn seconds(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| format!("'{text}' is no number of seconds"))?;
+    let value: f64 = text.parse().map_err(|_| format!("'{text}' is not a number of seconds"))?;
     let good = value.is_finite() && value.abs() <= 1e9;
-    good.then_some(value).ok_or_else(|| format!("{value} s is beyond any flight"))
+    good.then_some(value).ok_or_else(|| format!("{value} s is out of range: at most 1e9 s"))
 }
 
 struct RenderJob {

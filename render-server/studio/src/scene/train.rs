@@ -1,4 +1,4 @@
-//! `vizflyt scene train`: a scene from photos with known poses.
+//! `vizflyt scene train`: trains a scene from photos with known poses.
 
 mod kept;
 
@@ -17,17 +17,17 @@ use vizflyt_twin::{Dataset, Options, Passes, Times, Trainer};
 use self::kept::Kept;
 use super::progress::Progress;
 
-/// Trains a scene from photos with known poses, on a graphics card or the processor.
+/// Train a scene from photos with known poses, on a graphics card or the processor
 #[derive(Args, Debug)]
 #[command(after_help = "DATASET is a folder of one of these kinds:
   COLMAP      sparse/0 with cameras, images, points3D (.bin or .txt), and images/; masks/NAME.png may
-              black out what shall not count. Lenses: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL,
+              mask out pixels (black). Lenses: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL,
               OPENCV, OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE
-  nerfstudio  transforms.json, with masks, depth images and a PLY of points where it names them
+  nerfstudio  transforms.json, with masks, depth images and a PLY of points if it names them
 Images are PNG or JPEG. The scene keeps the dataset's frame and unit of length.
 
-A graphics card of any vendor (Vulkan) renders and takes derivatives, once its own of a test scene are the
-processor's; loss and optimiser stay with the processor. If it is lost on the way, the processor goes on.
+A graphics card of any vendor (Vulkan) renders and computes derivatives, if its results for a test scene match the
+processor's; loss and optimiser run on the processor. If the card is lost, the processor continues.
 
 Examples:
   vizflyt scene train my-hall -o my-hall.ply
@@ -35,50 +35,55 @@ Examples:
   vizflyt scene train my-hall -o my-hall.ply --width 640 --steps 7000 --splats 200000 --report my-hall.json
   vizflyt scene view my-hall.ply")]
 pub(crate) struct TrainArgs {
-    /// Folder with the photos and their poses
+    /// Folder with photos and their poses
     dataset: PathBuf,
-    /// Scene file to write; its name decides on the format: .ply, .spz, .sog, ...
+    /// Scene file to write; its name determines the format: .ply, .spz, .sog, ...
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Replaces a file that is already there
+    /// Replace an existing file
     #[arg(long)]
     force: bool,
-    /// Steps, one photo each
+    /// Number of steps, one photo each
     #[arg(long, default_value_t = 3000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     steps: u32,
-    /// The most splats
+    /// Maximum number of splats
     #[arg(long, default_value_t = 60_000, value_name = "N", value_parser = splats)]
     splats: usize,
-    /// Width that wider photos are made smaller to [px]
+    /// Maximum image width; wider photos are downscaled [px]
     #[arg(long, default_value_t = 320, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     width: u32,
-    /// Degree of the harmonics: how colours may change with the direction of view
+    /// Degree of spherical harmonics: how colours vary with the viewing direction
     #[arg(long, default_value_t = 2, value_name = "0..3", value_parser = clap::value_parser!(u8).range(0..=3))]
     sh_degree: u8,
-    /// What renders photos and takes derivatives
+    /// Renderer of photos and derivatives
     #[arg(long, value_enum, default_value_t, value_name = "KIND")]
     renderer: RendererKind,
-    /// Same dataset, same options, same seed: the same scene on the same kind of processor or card
+    /// Random seed
+    ///
+    /// The same dataset, options and seed give the same scene on the same kind of processor or
+    /// card.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Holds every N-th photo out of training, to judge by; 0 holds none out
+    /// Hold out every N-th photo for evaluation; 0: none
     #[arg(long, default_value_t = 8, value_name = "N")]
     hold_out: usize,
-    /// Photos have one brightness and colour: do not solve for each one's
+    /// Assume equal brightness and colour of all photos, instead of solving for them
     #[arg(long)]
     no_exposure: bool,
-    /// Trains for a renderer that dims splats smaller than a pixel (mip-splatting)
+    /// Train for a renderer that dims splats smaller than a pixel (mip-splatting)
     #[arg(long)]
     antialiased: bool,
-    /// Goes on with a training of the same photos and options that was interrupted; it is kept every minute
+    /// Resume an interrupted training with the same photos and options
+    ///
+    /// The state is saved every minute.
     #[arg(long)]
     resume: bool,
-    /// Writes what was done, how good it is and where the time of a step went as JSON
+    /// File for settings, quality and times of the training, as JSON
     #[arg(long, value_name = "FILE.json")]
     report: Option<PathBuf>,
 }
 
-/// What `--report` holds.
+/// Output of `--report`.
 #[derive(Debug, Serialize)]
 struct TrainingReport {
     dataset: String,
@@ -90,18 +95,18 @@ struct TrainingReport {
     splats: usize,
     seed: u64,
     antialiased: bool,
-    /// What rendered at the end: `cpu avx2`, or `gpu` and the adapter's name.
+    /// Renderer at the end: `cpu avx2`, or `gpu` and the adapter's name.
     renderer: String,
     seconds: f64,
-    /// The parts of a step, on average of those taken here.
+    /// Mean times of the parts of a step, over the steps of this run.
     ms_a_step: Times,
-    /// Of photos that training did not see; absent if none was held out.
+    /// Quality on the held-out photos; absent if there are none.
     #[serde(skip_serializing_if = "Option::is_none")]
     held_out: Option<Quality>,
 }
 
 fn splats(text: &str) -> Result<usize, String> {
-    let count: usize = text.parse().map_err(|_| format!("'{text}' is no whole number"))?;
+    let count: usize = text.parse().map_err(|_| format!("'{text}' is not a whole number"))?;
     if (1000..=20_000_000).contains(&count) {
         return Ok(count);
     }
@@ -129,12 +134,12 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
     );
     if let Some(first) = dataset.absent.first() {
         let absent = dataset.absent.len();
-        print_fmt!("absent       {absent} photos that have a pose are not there, such as {first}");
+        print_fmt!("absent       {absent} photos with a pose are missing, such as {first}");
     }
     let observed: usize = dataset.photos.iter().map(|photo| photo.target.points.len()).sum();
     if observed == 0 && dataset.photos.iter().all(|photo| photo.target.depth.is_empty()) {
         print_fmt!(
-            "no depth     neither points seen by three photos nor depth images: surfaces will be off"
+            "no depth     neither points seen by three photos nor depth images: surfaces will be inaccurate"
         );
     }
     let options = Options {
@@ -153,7 +158,7 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
         Some(checkpoint) => {
             print_fmt!("resumed      after {} of {} steps", checkpoint.steps(), args.steps);
             Trainer::resume(&dataset, options, passes, checkpoint)
-                .context("cannot go on with what was kept")?
+                .context("cannot resume the saved training")?
         }
         None => Trainer::with(&dataset, options, passes),
     };
@@ -163,7 +168,7 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
         let (step, splats) = (trainer.steps(), trainer.gaussians().len());
         if let Some(lost) = trainer.passes().take_lost() {
             let now = trainer.passes().name();
-            tracing::warn!("step {step}: {lost}; {now} goes on from here, at its own pace");
+            tracing::warn!("step {step}: {lost}; {now} continues from here, at its own speed");
         }
         progress.show(f64::from(step) / f64::from(args.steps), || {
             format!("step {step} of {}, {splats} splats, error {:.4}", args.steps, parts.l1)
@@ -211,17 +216,17 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
     Ok(())
 }
 
-/// Refuses what would only fail after the training.
+/// Rejects outputs that would only fail after the training.
 fn check_output(output: &Path, force: bool) -> Result<()> {
     if Format::of_name(output).is_none() {
         bail!("{}: no format has this ending; try .ply", output.display());
     }
     if output.exists() && !force {
-        bail!("{} is already there; give another name, or --force to replace it", output.display());
+        bail!("{} already exists; give another name, or --force to replace it", output.display());
     }
     let folder = output.parent().filter(|folder| !folder.as_os_str().is_empty());
     if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
-        bail!("the folder {} is not there; make it first", folder.display());
+        bail!("the folder {} does not exist; create it first", folder.display());
     }
     Ok(())
 }

@@ -1,5 +1,5 @@
-//! `vizflyt scene align`: where a captured scene lies in the room, written into its arena.toml, and whether that is known
-//! well enough to fly by.
+//! `vizflyt scene align`: estimates the pose and scale of a captured scene in the room, checks their accuracy, and
+//! writes them into arena.toml.
 
 mod page;
 mod report;
@@ -24,11 +24,13 @@ pub(super) use self::track::ClockArgs;
 use self::write::Changes;
 use crate::arena::file;
 
-/// Finds how a captured scene lies in the room, and writes it into `[scene]` of its arena.toml.
+/// Align a captured scene with the room
+///
+/// Estimates position, rotation and scale, and writes them into `[scene]` of the arena.toml.
 #[derive(Args, Debug)]
 #[command(
     group(ArgGroup::new("by").args(["tags", "floor", "track", "page"])),
-    after_help = "Without --tags, --floor or --track a page opens, on which floor and length are clicked.
+    after_help = "Without --tags, --floor or --track, a page opens to click points of the floor and a length.
 
 Examples:
   vizflyt scene align my-hall
@@ -38,54 +40,58 @@ Examples:
 
   vizflyt scene align my-hall --track hall.csv --capture my-capture --times times.csv
 
---capture is what the scene was trained from: a folder of COLMAP, or of nerfstudio (transforms.json).
-Points are in the scene file's own axes and units.
+--capture is the dataset from which the scene was trained: a folder of COLMAP, or of nerfstudio (transforms.json).
+Points are in the axes and units of the scene file.
 
-A track is a CSV of the poses of anything fixed to the camera, its header naming its columns: t or stamp [s] (or
-stamp_ns), x, y, z [m]; a TUM file (stamp tx ty tz qx qy qz qw); or Motive's or Vicon Tracker's export."
+A track is a CSV of the poses of a marker that is fixed to the camera, with a header: t or stamp [s] (or stamp_ns),
+x, y, z [m]. It can also be a TUM file (stamp tx ty tz qx qy qz qw), or an export of Motive or Vicon Tracker."
 )]
 pub(crate) struct AlignArgs {
-    /// An arena around a scene file, as `vizflyt arena new` makes one
+    /// Arena with a scene file, as made by `vizflyt arena new`
     arena: PathBuf,
-    /// Layout of printed tags that stand in the capture, surveyed in the room (`vizflyt tags print`)
+    /// Layout of printed tags in the capture, surveyed in the room
+    ///
+    /// `vizflyt tags print` writes the layout.
     #[arg(long, value_name = "LAYOUT", requires = "capture")]
     tags: Option<PathBuf>,
-    /// A motion capture's track of something fixed to the camera while it filmed
+    /// Motion capture track of a marker fixed to the camera during the capture
     #[arg(long, value_name = "TRACK", requires = "capture")]
     track: Option<PathBuf>,
     #[command(flatten)]
     clocks: track::ClockArgs,
-    /// The photos and their poses that the scene was trained from
+    /// Photos with poses from which the scene was trained
     #[arg(long, value_name = "DATASET")]
     capture: Option<PathBuf>,
-    /// A point of the floor; three or more. The first becomes the origin, the second lies on the x axis
+    /// Point on the floor; give at least three
+    ///
+    /// The first becomes the origin. The second defines the x axis.
     #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true, requires_all = ["above", "length"])]
     floor: Vec<DVec3>,
-    /// A point above the floor
+    /// Point above the floor
     #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true)]
     above: Option<DVec3>,
-    /// Two points, and how far apart they are in the room [m]
+    /// Two points, and their distance in the room [m]
     #[arg(long, value_name = "P:P=METRES", value_parser = length, allow_hyphen_values = true)]
     length: Option<([DVec3; 2], f64)>,
-    /// How well points were picked, or tags surveyed, one sigma [mm]
+    /// Standard deviation of picked points or surveyed tags [mm]
     #[arg(long, value_name = "MM", default_value_t = 5.0)]
     sigma_mm: f64,
-    /// What the twin may be off within the fence, at most [m]
+    /// Maximum position error of the twin within the fence [m]
     #[arg(long, value_name = "METRES", default_value_t = 0.1)]
     allow_m: f64,
-    /// Writes the place even where it is not known well enough
+    /// Write the alignment even if it is too uncertain
     #[arg(long)]
     force: bool,
-    /// Opens the page, as without a method
+    /// Open the page, as without any method
     #[arg(long)]
     page: bool,
-    /// Where the page is served; port 0 takes a free one
+    /// Address of the page; port 0 selects a free one
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
     http: SocketAddr,
-    /// What draws the page's pictures
+    /// Renderer of the page's images
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
-    /// Only prints the page's address
+    /// Only print the page's address
     #[arg(long)]
     no_browser: bool,
 }
@@ -115,7 +121,7 @@ pub(crate) fn run(args: &AlignArgs) -> Result<ExitCode> {
             return Ok(ExitCode::SUCCESS);
         }
         _ => bail!(
-            "give --tags or --track with --capture, or --floor with --above and --length; the page needs none of them"
+            "give --tags or --track with --capture, or --floor with --above and --length; or none of them, to open the page"
         ),
     };
     let PlacementReport { lines, is_known } = report::report(&fit, &arena.geofence, args.allow_m);
@@ -139,12 +145,12 @@ fn point(text: &str) -> Result<DVec3, String> {
     let numbers: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse()).collect();
     match numbers.as_deref() {
         Ok(&[x, y, z]) if DVec3::new(x, y, z).is_finite() => Ok(DVec3::new(x, y, z)),
-        _ => Err(format!("'{text}' is no point; write it as 0.1,-2,3.5")),
+        _ => Err(format!("'{text}' is not a point; write it as 0.1,-2,3.5")),
     }
 }
 
 fn length(text: &str) -> Result<([DVec3; 2], f64), String> {
-    let wrong = || format!("'{text}' is no known length; write it as 0,1,2:0,1,4=2.0");
+    let wrong = || format!("'{text}' is not a known length; write it as 0,1,2:0,1,4=2.0");
     let (ends, metres) = text.split_once('=').ok_or_else(wrong)?;
     let (from, to) = ends.split_once(':').ok_or_else(wrong)?;
     let metres: f64 = metres.trim().parse().map_err(|_| wrong())?;
@@ -154,10 +160,10 @@ fn length(text: &str) -> Result<([DVec3; 2], f64), String> {
     Ok(([point(from)?, point(to)?], metres))
 }
 
-/// What does not move along with a scene.
+/// Note if the arena has a crop box, which the alignment does not change.
 const CROP: &str =
-    "scene.crop is in metres of the room and did not move along; correct or remove it";
-/// A tape measure, laid by hand.
+    "scene.crop is in metres of the room and was not transformed; correct or remove it";
+/// Relative standard deviation of a length that was measured with a tape.
 const LENGTH_SHARE: f64 = 0.001;
 
 #[cfg(test)]
@@ -165,7 +171,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn points_and_lengths_are_read() {
+    fn parses_points_and_lengths() {
         assert_eq!(point("1, -2,3.5"), Ok(DVec3::new(1.0, -2.0, 3.5)));
         assert_eq!(length("0,0,0:0,0,4=2.5"), Ok(([DVec3::ZERO, DVec3::Z * 4.0], 2.5)));
         for wrong in ["1,2", "1,2,x", "1,2,inf", ""] {

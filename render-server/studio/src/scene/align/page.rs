@@ -1,4 +1,4 @@
-//! By clicks on a page: the server finds the points, what is here solves and writes.
+//! Alignment by clicks on a page. The server provides the points; this module solves for the placement and writes it.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -39,7 +39,7 @@ pub(super) fn run(args: &AlignArgs, path: &Path) -> Result<()> {
     web::align(view, Arc::new(clicked), show_page(args.no_browser))
 }
 
-/// Places by what was clicked, for one arena.
+/// Solver for the clicked points of an arena.
 struct Clicked {
     path: PathBuf,
     click_sigma_m: f64,
@@ -53,11 +53,11 @@ impl Clicked {
         ArenaConfig::parse(&text).with_context(|| self.path.display().to_string())
     }
 
-    /// Returns the place, and whether its scale is known.
+    /// Returns the placement, and whether its scale is known.
     fn fit(&self, picks: &Picks) -> Result<(Fit, bool)> {
         let length = match (&picks.length, picks.floor.as_slice()) {
             (Some(length), _) => (length.ends, length.metres),
-            // As large as it is now, until a length is known.
+            // Until a length is known, the current scale is kept.
             (None, &[from, to, ..]) => {
                 let unit_m = Placement::of(&self.arena()?.scene).world_from_scene.scale;
                 ([from, to], from.distance(to) * unit_m)
@@ -83,10 +83,10 @@ impl Aligner for Clicked {
         let place = place(&fit.world_from_scene);
         let PlacementReport { mut lines, is_known } = report(&fit, &picks.geofence, self.allow_m);
         if !has_scale {
-            // Where the size is a guess, so is all that is said in metres.
+            // Without a known scale, values in metres are meaningless.
             lines.clear();
             let text =
-                "is not known: click both ends of a length that you have measured".to_owned();
+                "unknown: click both ends of a measured length".to_owned();
             lines.push(Line { key: "scale", text });
         }
         Ok(Solved { place, lines, go: has_scale.then_some(is_known) })
@@ -95,7 +95,7 @@ impl Aligner for Clicked {
     fn save(&self, wish: &Wish) -> Result<Vec<Line>, String> {
         let (fit, has_scale) = self.fit(&wish.picks).map_err(in_words)?;
         if !has_scale {
-            return Err("click both ends of a length that you have measured first".to_owned());
+            return Err("first click both ends of a measured length".to_owned());
         }
         let PlacementReport { mut lines, is_known } =
             report(&fit, &wish.picks.geofence, self.allow_m);
@@ -121,7 +121,7 @@ impl Aligner for Clicked {
     }
 }
 
-/// Turns and moves a place, whose first point of the floor is the origin, to where it is wanted.
+/// Rotates and moves a placement with the origin at the first point of the floor, as requested in `picks`.
 fn in_room(mut fit: Fit, picks: &Picks) -> Fit {
     let turn = DQuat::from_rotation_z(picks.yaw_deg.to_radians());
     let by_m = picks.origin_at_m;
@@ -137,7 +137,7 @@ fn place(similarity: &Similarity) -> Place {
     Place::new(&WorldFromScene { scale, rotation, translation_m })
 }
 
-#[allow(clippy::needless_pass_by_value)] // Why: map_err gives it away.
+#[allow(clippy::needless_pass_by_value)] // Why: signature for map_err.
 fn in_words(error: anyhow::Error) -> String {
     format!("{error:#}")
 }
@@ -154,7 +154,7 @@ mod tests {
         limits = { max_speed_mps = 2.0, max_acceleration_mps2 = 4.0 }\n\
         cameras = [{ name = \"front\", width_px = 64, height_px = 48, horizontal_fov_deg = 90, position_m = [0, 0, 0] }]\n";
 
-    /// A floor of 4 by 3 m in a file of 2 m a unit, y down.
+    /// Returns the picks of a floor of 4 by 3 m, in a file with 2 m per unit and y down.
     fn picks() -> Picks {
         let scene = |x: f64, y: f64, z: f64| DVec3::new(x, -z, y) / 2.0;
         Picks {
@@ -180,13 +180,13 @@ mod tests {
     }
 
     #[test]
-    fn what_was_clicked_is_solved_and_saved() {
+    fn solves_and_saves_the_clicked_points() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("arena.toml");
         std::fs::write(&path, ARENA).unwrap();
         let clicked = Clicked { path: path.clone(), click_sigma_m: 0.005, allow_m: 0.1 };
         let (fit, has_scale) = clicked.fit(&picks()).unwrap();
-        // The second point lies 4 m along y from where the first was said to be.
+        // The second point lies 4 m along y from the chosen origin.
         let second_m = fit.world_from_scene.transform_point(picks().floor[1]);
         assert!(has_scale && second_m.distance(DVec3::new(0.5, 3.75, 0.7)) < 1e-9, "{second_m}");
         let solved = clicked.solve(&picks()).unwrap();
@@ -203,7 +203,7 @@ mod tests {
         assert!((placed.scale - 2.0).abs() < 1e-9);
         let back_m = placed.rotation * picks().floor[1] * placed.scale + placed.translation_m;
         assert!(back_m.distance(second_m) < 1e-9);
-        // A start outside its fence is no arena: nothing is written.
+        // A start outside the fence makes the arena invalid: nothing is written.
         let outside = Spawn { position_m: DVec3::splat(90.0), yaw_deg: 0.0 };
         let why = clicked.save(&Wish { spawn: outside, ..wish }).unwrap_err();
         assert!(why.contains("spawn"), "{why}");
@@ -211,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_saved_that_is_not_known() {
+    fn saves_nothing_that_is_too_uncertain() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("arena.toml");
         std::fs::write(&path, ARENA).unwrap();

@@ -1,16 +1,16 @@
-//! What is said of a place, on the command line and on the page alike.
+//! Report of an alignment, for the command line and the page.
 
 use vizflyt_arena::config::Geofence;
 use vizflyt_server::web::Line;
 use vizflyt_twin::align::{Fit, Similarity};
 
-/// What is said of a place, and whether it is known well enough.
+/// Lines of the report, and whether the alignment is accurate enough.
 pub(super) struct PlacementReport {
     pub lines: Vec<Line>,
     pub is_known: bool,
 }
 
-/// Says how well a place is known, and whether that is enough for what lies within a fence.
+/// Returns the report of an alignment: its uncertainty, and whether its error within the fence is at most `allow_m`.
 pub(super) fn report(fit: &Fit, fence: &Geofence, allow_m: f64) -> PlacementReport {
     let bound_m = fit.bound_within_m(fence.min_m, fence.max_m);
     let is_known = bound_m <= allow_m;
@@ -26,7 +26,7 @@ pub(super) fn report(fit: &Fit, fence: &Geofence, allow_m: f64) -> PlacementRepo
         line(
             "residual",
             format!(
-                "{:.2} cm rms, {:.2} cm at worst, over {} points; {} left out",
+                "{:.2} cm rms, {:.2} cm maximum, over {} points; {} rejected",
                 fit.rms_m * 1e2,
                 fit.worst_m * 1e2,
                 fit.used,
@@ -36,12 +36,12 @@ pub(super) fn report(fit: &Fit, fence: &Geofence, allow_m: f64) -> PlacementRepo
         line("bound", format!("{:.1} cm within the fence, at three sigmas", bound_m * 1e2)),
     ];
     lines.push(if is_known {
-        line("go", format!("within the fence the twin is off by at most {:.1} cm", bound_m * 1e2))
+        line("go", format!("the error of the twin within the fence is at most {:.1} cm", bound_m * 1e2))
     } else {
         line(
             "NO GO",
             format!(
-                "within the fence the twin may be off by {:.1} cm; {:.1} are allowed (--allow-m): use points \
+                "the error of the twin within the fence can reach {:.1} cm; {:.1} are allowed (--allow-m): use points \
                  farther apart, more tags, or a smaller fence",
                 bound_m * 1e2,
                 allow_m * 1e2

@@ -1,4 +1,4 @@
-//! By printed tags whose layout is known, seen in the photos that the scene was trained from.
+//! Alignment by printed tags of a known layout in the photos from which the scene was trained.
 
 use std::path::Path;
 
@@ -13,12 +13,12 @@ use vizflyt_twin::align::corners::{self, Ray};
 use vizflyt_twin::align::points::{self, Pair};
 use vizflyt_twin::dataset::Photo;
 
-/// Finds the place by tags that the photos show.
+/// Estimates the placement from the tags in the photos.
 pub(super) fn find(layout_path: &Path, capture: &Path, sigma_m: f64) -> Result<Fit> {
     let layout = TagLayout::read(layout_path)?;
     if layout.frame != LayoutFrame::World {
         print_fmt!(
-            "note        {} is not in the world frame: its own becomes the world's",
+            "note        {} is not in the world frame: its frame becomes the world frame",
             layout_path.display()
         );
     }
@@ -26,7 +26,7 @@ pub(super) fn find(layout_path: &Path, capture: &Path, sigma_m: f64) -> Result<F
     let mut families: Vec<_> = layout.tags.iter().map(|tag| tag.family).collect();
     families.dedup();
     let mut detector = Detector::new(&families, DetectorSettings::default());
-    // Of each tag of the layout, what sees each of its corners.
+    // For each tag of the layout, the lines of sight to its corners.
     let mut sights: Vec<[Vec<Ray>; 4]> = layout.tags.iter().map(|_| Default::default()).collect();
     let mut with_tags = 0;
     for photo in &dataset.photos {
@@ -50,20 +50,20 @@ pub(super) fn find(layout_path: &Path, capture: &Path, sigma_m: f64) -> Result<F
         tags += usize::from(pairs.len() > before);
     }
     print_fmt!(
-        "seen        {tags} of {} tags from two places or more, in {with_tags} of {} photos",
+        "seen        {tags} of {} tags from two positions or more, in {with_tags} of {} photos",
         layout.tags.len(),
         dataset.photos.len()
     );
     ensure!(
         tags > 0,
-        "no tag of {} is seen from two places in {}; are the photos sharp, and is it the layout of these tags?",
+        "no tag of {} is seen from two positions in {}; are the photos sharp, and is it the layout of these tags?",
         layout_path.display(),
         capture.display()
     );
     Ok(points::fit(&pairs, sigma_m)?)
 }
 
-/// Returns the tags in a photo, by their index, with the lines of sight to their corners.
+/// Returns the indices of the tags in a photo, with the lines of sight to their corners.
 fn rays(photo: &Photo, tags: &[Tag], detector: &mut Detector) -> Result<Vec<(usize, [Ray; 4])>> {
     let target = &photo.target;
     // ITU-R BT.601.

@@ -1,4 +1,4 @@
-//! By a motion capture that followed the camera: its recording, and when each image was taken.
+//! Alignment by a motion capture track of the camera and the times of the images.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -13,19 +13,25 @@ use vizflyt_twin::align::track::{self, CameraPose, TrackFit, Tracked};
 use vizflyt_twin::align::{AlignError, Fit, recording};
 use vizflyt_twin::dataset;
 
-/// When images and track were taken.
+/// Times of images and track.
 #[derive(Args, Clone, Debug, Default, PartialEq, Serialize)]
 pub(in crate::scene) struct ClockArgs {
-    /// When each image was taken: lines of name,stamp_ns [default: stamps.csv of the capture, or the images' names]
+    /// Times of the images: lines of name,stamp_ns
+    ///
+    /// [default: stamps.csv of the capture, or the names of the images]
     #[arg(long, value_name = "CSV", requires = "track")]
     times: Option<PathBuf>,
-    /// Images a second, where their names count them [Hz]
+    /// Frame rate, if file names are frame numbers [Hz]
     #[arg(long, value_name = "HZ", requires = "track", conflicts_with = "times")]
     rate: Option<f64>,
-    /// What the two clocks may differ by, at most [default: 2, or 30 where they begin far apart]
+    /// Maximum offset between the two clocks
+    ///
+    /// [default: 2, or 30 if their first times are far apart]
     #[arg(long, value_name = "SECONDS", requires = "track")]
     max_offset_s: Option<f64>,
-    /// Where what is tracked sits: right of the lens, below it, ahead of it, measured; solved unless given [m]
+    /// Position of the tracked marker relative to the lens (right, down, forward) [m]
+    ///
+    /// [default: estimated]
     #[arg(
         long,
         value_name = "X,Y,Z",
@@ -34,7 +40,7 @@ pub(in crate::scene) struct ClockArgs {
         allow_hyphen_values = true
     )]
     tracked_at: Option<DVec3>,
-    /// The axis of the track that points up: z, or y as Motive has it unless told otherwise
+    /// Vertical axis of the track: z, or y for Motive's default export
     #[arg(long, value_enum, value_name = "AXIS", requires = "track", default_value_t)]
     track_up: TrackUp,
 }
@@ -47,21 +53,21 @@ enum TrackUp {
 }
 
 impl ClockArgs {
-    /// Whether it is said when images were taken.
+    /// Whether options define the times of the images.
     pub(in crate::scene) fn has_times(&self) -> bool {
         self.times.is_some() || self.rate.is_some()
     }
 }
 
-/// Finds the place of a dataset by a recording.
+/// Estimates the placement of a dataset from a track.
 pub(super) fn find(clocks: &ClockArgs, path: &Path, capture: &Path, sigma_m: f64) -> Result<Fit> {
     fit(clocks, path, cameras(clocks, capture)?, capture, sigma_m)
 }
 
-/// Finds the place of cameras by a recording of what they filmed, `capture`.
+/// Estimates the placement of cameras from a track. `capture` names the dataset in messages.
 ///
 /// # Errors
-/// A recording that cannot be read, or that is not of these cameras.
+/// The track cannot be read, or does not match the cameras.
 pub(in crate::scene) fn fit(
     clocks: &ClockArgs,
     path: &Path,
@@ -77,11 +83,11 @@ pub(in crate::scene) fn fit(
     let [begin, end] = [cameras[0].at_s, cameras[cameras.len() - 1].at_s];
     print_fmt!("track       {} poses of {}", track.len(), span(first, last));
     print_fmt!("images      {} of {}", cameras.len(), span(begin, end));
-    // By chance two clocks may have a moment in common.
+    // Unrelated clocks can overlap a little by chance.
     let is_shared = 2.0 * (last.min(end) - first.max(begin)) > end - begin;
     if !is_shared {
         print_fmt!(
-            "note        the clocks have little in common: both are taken to begin together"
+            "note        the clocks hardly overlap: both are assumed to begin at the same time"
         );
     }
     let start_s = if is_shared { begin } else { first };
@@ -97,23 +103,23 @@ pub(in crate::scene) fn fit(
             .map_err(|error| with_advice(error, max_offset_s))?;
     print_fmt!("clocks      {:+.3} s from the images' to the track's", offset_s + start_s - begin);
     print_fmt!(
-        "tracked     {:.3}, {:.3}, {:.3} m from the lens: right, down, ahead",
+        "tracked     {:.3}, {:.3}, {:.3} m from the lens: right, down, forward",
         p.x,
         p.y,
         p.z
     );
     check(&fit, p, path, capture)?;
-    // Of images whose lower edge was held downwards this is -1.
+    // For images with the lower edge held downwards, this is -1.
     let down =
         |camera: &CameraPose| (fit.world_from_scene.rotation * (camera.rotation * DVec3::Y)).z;
     if cameras.iter().map(down).sum::<f64>() > -0.3 * cameras.len() as f64 {
         print_fmt!(
-            "note        so the camera was held on its side; or is another axis of the track up (--track-up)?"
+            "note        by this, the camera was held on its side; is another axis of the track vertical (--track-up)?"
         );
     }
     ensure!(
         offset_s.abs() < max_offset_s - 0.05 || max_offset_s < 0.1,
-        "the clocks differ by {offset_s:+.2} s, the most that was tried; give more by --max-offset-s"
+        "the clocks differ by {offset_s:+.2} s, the maximum that was tried; increase --max-offset-s"
     );
     Ok(fit)
 }
@@ -121,7 +127,7 @@ pub(in crate::scene) fn fit(
 fn with_advice(error: AlignError, max_offset_s: f64) -> anyhow::Error {
     let advice = match &error {
         AlignError::HardlyMoved(_) => {
-            "where the tracked point sits beside the lens cannot be seen; measure it, and give it by --tracked-at"
+            "the position of the tracked marker relative to the lens cannot be estimated; measure it and give --tracked-at"
                 .to_owned()
         }
         AlignError::TooFew { .. } => format!(
@@ -133,12 +139,12 @@ fn with_advice(error: AlignError, max_offset_s: f64) -> anyhow::Error {
     anyhow::Error::from(error).context(advice)
 }
 
-/// A similarity fits any two paths somehow: what is left says whether they are one.
+/// Rejects a fit with large residuals: a similarity fits any two paths somehow, even unrelated ones.
 fn check(fit: &Fit, point_in_cam_m: DVec3, path: &Path, capture: &Path) -> Result<()> {
     let used = fit.used + fit.left_out;
     if fit.rms_m > MOST_LEFT_M || fit.left_out * 4 > used || point_in_cam_m.length() > ARM_M {
         bail!(
-            "{} is not the track of the camera of {}: {:.0} cm rms are left, {} of {used} images fit nowhere; is it of the \
+            "{} is not the track of the camera of {}: residual {:.0} cm rms, {} of {used} images do not fit; is it of the \
              same recording, of the right object, with the right times (--times, --rate), and z up (--track-up)?",
             path.display(),
             capture.display(),
@@ -154,7 +160,7 @@ fn read_track(path: &Path, up: TrackUp) -> Result<Vec<Tracked>> {
     let size = size.with_context(|| format!("cannot read {}", path.display()))?;
     ensure!(
         size <= MAX_BYTES,
-        "{} has {} MB; cut the recording to the time of the capture: {} MB are the most",
+        "{} has {} MB; cut the recording to the time of the capture: the maximum is {} MB",
         path.display(),
         size >> 20,
         MAX_BYTES >> 20
@@ -172,14 +178,14 @@ fn read_track(path: &Path, up: TrackUp) -> Result<Vec<Tracked>> {
     let gap_s = gaps[gaps.len() / 2];
     ensure!(
         gap_s <= 0.1,
-        "{}: {:.1} poses a second do not follow a hand; 10 are the least, 100 are good",
+        "{}: {:.1} poses per second are too few for a hand-held camera; the minimum is 10, and 100 is good",
         path.display(),
         1.0 / gap_s
     );
     Ok(track)
 }
 
-/// Returns a capture's cameras, in the order of their times.
+/// Returns the camera poses of a capture with their times.
 fn cameras(clocks: &ClockArgs, capture: &Path) -> Result<Vec<CameraPose>> {
     let poses = dataset::read_poses(capture)?;
     let names: Vec<&str> = poses.iter().map(|(name, _)| name.as_str()).collect();
@@ -196,7 +202,7 @@ fn cameras(clocks: &ClockArgs, capture: &Path) -> Result<Vec<CameraPose>> {
     Ok(cameras)
 }
 
-/// Returns when images were taken. [s]
+/// Returns the times of images. [s]
 pub(in crate::scene) fn times(
     clocks: &ClockArgs,
     capture: &Path,
@@ -212,7 +218,7 @@ pub(in crate::scene) fn times(
             .with_context(|| path.display().to_string());
     }
     if let Some(rate_hz) = clocks.rate {
-        ensure!(rate_hz > 0.0 && rate_hz.is_finite(), "--rate {rate_hz} is no rate");
+        ensure!(rate_hz > 0.0 && rate_hz.is_finite(), "--rate {rate_hz} is not a rate");
         return names
             .iter()
             .map(|name| {
@@ -234,15 +240,15 @@ pub(in crate::scene) fn times(
             let seconds = digits.parse::<f64>().ok().filter(|_| is_decimal);
             seconds.with_context(|| {
                 format!(
-                    "when {name} was taken is not known: its name is no time; give --times with lines of name,stamp_ns, or \
-                     --rate where names count the images of a video"
+                    "the time of {name} is not known: its name is not a time; give --times with lines of name,stamp_ns, or \
+                     --rate if file names are frame numbers"
                 )
             })
         })
         .collect()
 }
 
-/// Returns the stamps of images by their names, with or without their folders. [s]
+/// Returns the stamps of images from a table, by names with or without folders. [s]
 fn of_table(stamps: &HashMap<String, u64>, names: &[&str]) -> Result<Vec<f64>> {
     names
         .iter()
@@ -259,14 +265,14 @@ fn stem(name: &str) -> &str {
 }
 
 fn counted(name: &str) -> String {
-    format!("{name} ends in no number that --rate could count by; give --times")
+    format!("{name} does not end with a frame number, which --rate needs; give --times")
 }
 
-/// Structure from motion and a motion capture agree within 2 cm of a walk. [m]
+/// Maximum RMS residual. Structure from motion and motion capture agree within 2 cm. [m]
 const MOST_LEFT_M: f64 = 0.04;
-/// What is tracked is fixed to the camera, or to who carries it. [m]
+/// Maximum distance of the marker, which is fixed to the camera or to the person who carries it. [m]
 const ARM_M: f64 = 1.5;
-/// An hour at 1 kHz.
+/// Maximum file size: one hour at 1 kHz.
 const MAX_BYTES: u64 = 512 << 20;
 
 #[cfg(test)]
@@ -278,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn names_tell_the_time() {
+    fn reads_times_from_options_tables_and_names() {
         let folder = tempfile::tempdir().unwrap();
         let found = |rate, names: &[&str]| times(&clocks(rate), folder.path(), names);
         let seconds = |rate, names: &[&str]| found(rate, names).unwrap();
@@ -291,8 +297,8 @@ mod tests {
         };
         refused(None, "frame_00045.jpg", "--rate");
         refused(None, "door.jpg", "not known");
-        refused(Some(30.0), "door.jpg", "no number");
-        refused(Some(0.0), "1.jpg", "no rate");
+        refused(Some(30.0), "door.jpg", "frame number");
+        refused(Some(0.0), "1.jpg", "not a rate");
         std::fs::write(folder.path().join("stamps.csv"), "name,stamp_ns\n1.png,500000000\n")
             .unwrap();
         assert_eq!(seconds(None, &["images/1.png"]), [0.5]);

@@ -1,4 +1,4 @@
-//! Writes a place into an arena.toml that people have written: all else stays, comments too.
+//! Writes an alignment into an existing arena.toml. All other keys and all comments stay.
 
 use std::path::Path;
 
@@ -9,19 +9,19 @@ use vizflyt_twin::align::Similarity;
 
 use crate::arena::file::{self, numbers, set, table};
 
-/// What is written.
+/// Changes of an arena.toml.
 pub(super) struct Changes {
     pub place: Similarity,
-    /// Where it is another than before.
+    /// New fence, if it changed.
     pub fence: Option<Geofence>,
-    /// Likewise.
+    /// New start, if it changed.
     pub spawn: Option<Spawn>,
 }
 
-/// Writes changes into an arena's file.
+/// Writes changes into the file of an arena.
 ///
 /// # Errors
-/// A file that cannot be read or written, or an arena that would be none.
+/// The file cannot be read or written, or the arena would be invalid.
 pub(super) fn write(path: &Path, changes: &Changes) -> Result<()> {
     file::change(path, |document| put(document, changes))
 }
@@ -40,7 +40,7 @@ fn put(document: &mut DocumentMut, changes: &Changes) -> Result<()> {
 fn put_place(document: &mut DocumentMut, place: &Similarity) -> Result<()> {
     let scene = document.get_mut("scene").context("the file has no scene")?;
     if let Some(file) = scene.as_str().map(str::to_owned) {
-        // The short form is a line before any table, and becomes a line there.
+        // The short form `scene = "..."` precedes all tables. An inline table can replace it there.
         let mut long = InlineTable::new();
         long.insert("file", file.into());
         *scene = value(long);
@@ -74,13 +74,13 @@ mod tests {
     };
 
     #[test]
-    fn a_place_is_written_and_all_else_stays() {
+    fn writes_the_placement_and_keeps_the_rest() {
         let rest = "\n# The net.\n[geofence]\nmin_m = [0, 0, 0]   # west\nmax_m = [9, 4, 3]\n";
         for scene in [
             "scene = \"room.ply\" # captured\n",
             "[scene]\nfile = \"room.ply\"\nup = \"-y\"\nyaw_deg = 4.0\n",
         ] {
-            // A table of its own comes after the lines of the root.
+            // Both forms of `scene`: as a string and as a table.
             let text = format!("name = \"hall\"\n{scene}{rest}");
             let changes = Changes { place: PLACE, fence: None, spawn: None };
             let placed = changed(&text, &changes).unwrap();
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn fence_and_start_are_written_and_comments_stay() {
+    fn writes_fence_and_start_and_keeps_comments() {
         let text = "scene = { file = \"a.ply\", up = \"-y\", antialiased = true, crop = { min_m = [0, 0, 0], \
                     max_m = [1, 1, 1] } }\nspawn = { position_m = [1, 2, 0] } # the mat\n\n# The net.\n[geofence]\n\
                     min_m = [0, 0, 0]   # west\nmax_m = [9, 4, 3]\n";

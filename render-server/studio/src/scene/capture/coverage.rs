@@ -1,4 +1,4 @@
-//! The walk from above: where pictures were taken, where none were placed, what was seen.
+//! Map of a walk from above: path of the camera, gaps without placed pictures, and seen areas.
 
 use std::fmt::Write as _;
 
@@ -8,8 +8,8 @@ use super::images::{Pictures, clock};
 use super::metric::Metric;
 use super::unseen::{Area, CELL_M};
 
-/// Returns a picture of the walk, as SVG: the way in the colours of time, points of the room, tags, and a broken line
-/// with its times where pictures are missing; what was not seen is shaded. Empty where nothing was placed.
+/// Returns a map of the walk as SVG: the path coloured by time, points of the room, and tags. A dashed line with times
+/// marks missing pictures; unseen areas are shaded. Empty if no picture was placed.
 pub(super) fn svg(
     metric: &Metric,
     pictures: &Pictures,
@@ -111,7 +111,7 @@ pub(super) fn svg(
         let time = if pictures.of_video { clock(placed.at_s) } else { escaped(&placed.name) };
         label(&mut svg, x + 5.0, y + 12.0, "#06c", &time);
     }
-    // How long a metre is.
+    // Scale bar.
     let metres = [0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
     let bar_m = metres.into_iter().find(|m| m * scale > WIDTH / 10.0).unwrap_or(100.0);
     let (right, y) = (12.0 + bar_m * scale, height - 12.0);
@@ -121,7 +121,7 @@ pub(super) fn svg(
     svg + "</svg>"
 }
 
-/// Returns a run of pictures as people find it.
+/// Returns the range of a run of pictures, as times of a video or as file names.
 pub(super) fn span(pictures: &Pictures, first: usize, last: usize) -> String {
     let place = |i: usize| {
         let picture = &pictures.pictures[i];
@@ -131,7 +131,7 @@ pub(super) fn span(pictures: &Pictures, first: usize, last: usize) -> String {
     if from == to { from } else { format!("{from} to {to}") }
 }
 
-/// From blue at the beginning to red at the end.
+/// Returns the hue of a time: from blue at the beginning to red at the end.
 fn hue(share: f64) -> f64 {
     230.0 * (1.0 - share.clamp(0.0, 1.0))
 }
@@ -143,14 +143,14 @@ fn label(svg: &mut String, x: f64, y: f64, colour: &str, text: &str) {
     );
 }
 
-/// Returns a text for HTML.
+/// Escapes a text for HTML.
 pub(super) fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
-/// Of the picture. [px]
+/// Width of the map. [px]
 const WIDTH: f64 = 860.0;
-/// More make the page large, and show no more.
+/// Maximum number of points; more would only enlarge the page.
 const MOST_POINTS: usize = 4000;
 
 #[cfg(test)]
@@ -160,7 +160,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_gap_is_shown_with_its_times() {
+    fn marks_a_gap_with_its_times() {
         let picture = |i: usize| Picture {
             name: format!("{i}.jpg"),
             at_s: i as f64 * 3.0,

@@ -1,5 +1,5 @@
-//! The last stage: the trained scene without what stands in its capture's own way, an arena around what was seen, and
-//! whether that can be flown.
+//! Last stage: removes splats that contradict the capture, creates an arena around the seen space, and checks whether
+//! it can be flown.
 
 use std::path::Path;
 
@@ -23,33 +23,33 @@ use vizflyt_twin::carve::{CarveOptions, Seen, Voxels, carve};
 use super::metric::{Metric, Placed};
 use super::unseen::{Area, areas};
 
-/// What the stage leaves, beside `scene.ply` and `arena.toml`.
+/// Result of the stage, in addition to `scene.ply` and `arena.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Finished {
-    /// Splats that stay.
+    /// Number of remaining splats.
     pub(super) splats: usize,
-    /// Splats that photos look through, or that hang where the camera was.
+    /// Number of removed splats: photos look through them, or they are on the camera's path.
     pub(super) carved: usize,
-    /// Share of the fence that photos looked through.
+    /// Share of the fence's voxels that photos look through.
     pub(super) seen_share: f64,
-    /// Where they did not at the heights of flight, the largest first.
+    /// Unseen areas at the heights of flight, the largest first.
     pub(super) unseen: Vec<Area>,
-    /// Voxels that are solid, and their side. [m]
+    /// Number of solid voxels.
     pub(super) solid_voxels: usize,
     pub(super) voxel_m: f64,
-    /// Solid voxels in which the camera itself has been.
+    /// Number of camera positions within solid voxels.
     pub(super) solid_on_way: usize,
-    /// What was seen goes from here. [m, world]
+    /// Minimum corner of the fence. [m, world]
     pub(super) fence_min_m: DVec3,
-    /// To here. [m, world]
+    /// Maximum corner of the fence. [m, world]
     pub(super) fence_max_m: DVec3,
     /// [m, world]
     pub(super) spawn_m: DVec3,
-    /// What speaks against flying, in words.
+    /// Problems that prevent a flight, in words.
     pub(super) findings: Vec<String>,
 }
 
-/// Carves, prunes, and puts an arena around it.
+/// Carves and prunes the scene, and writes its arena.
 pub(super) fn finish(
     name: &str,
     dataset: &Dataset,
@@ -86,7 +86,7 @@ pub(super) fn finish(
     let on_way = ways.iter().filter(|p| baked.field.obstacle_distance_m(**p) < 0.0).count();
     let fit = check_fit(&carved.splats, &arena, &baked.field);
     let obstacles = Obstacles::from(baked.field);
-    // The roomiest place of the way that the vehicle can climb from.
+    // Start at the position of the path with the most free space from which the vehicle can climb.
     let mut starts = starts(&metric.way, floor_m, &carved.seen, &arena, &obstacles);
     starts.truncate(STARTS);
     let mut first = None;
@@ -104,7 +104,7 @@ pub(super) fn finish(
         arena.spawn = start;
         findings.extend(against.iter().map(ToString::to_string));
     }
-    arena.validate().context("no arena fits around the capture")?;
+    arena.validate().context("cannot create a valid arena for the capture")?;
     let text = format!("{HEAD}{}", arena.to_toml()?);
     ArenaConfig::parse(&text).context("the arena would not be read again")?;
     std::fs::write(folder.join("arena.toml"), text).context("cannot write arena.toml")?;
@@ -132,7 +132,7 @@ fn read(trained: &Path) -> Result<Splats> {
     Ok(format::read(&path).with_context(|| format!("cannot read {}", path.display()))?.splats)
 }
 
-/// Returns the voxels around what is dense and around the way.
+/// Returns the voxels around the scene's core and the camera's path.
 fn region(splats: &Splats, ways: &[DVec3]) -> Voxels {
     let [min_m, max_m] = bounds(core(splats, |mean| mean));
     let low_m = ways.iter().fold(min_m, |low, p| low.min(*p)) - REGION_M;
@@ -143,7 +143,7 @@ fn region(splats: &Splats, ways: &[DVec3]) -> Voxels {
     Voxels { min_m: low_m, side_m, size }
 }
 
-/// Returns the height of the floor: the capture's own near z = 0, else that. [m, world]
+/// Returns the height of the floor: that of the capture if it is found near z = 0, otherwise 0. [m, world]
 fn floor(dataset: &Dataset, metric: &Metric) -> f64 {
     let points: Vec<DVec3> = dataset.points.iter().map(|point| point.position.as_dvec3()).collect();
     let held = metric.way.iter().map(|placed| Held { position: placed.position_m, up: DVec3::Z });
@@ -151,8 +151,8 @@ fn floor(dataset: &Dataset, metric: &Metric) -> f64 {
     found.filter(|level| level.up.z > FLAT_COS).map_or(0.0, |level| level.height)
 }
 
-/// Returns the box around what photos looked through at the heights of flight, without the few voxels that are farthest
-/// out; the way is in it. [m, world]
+/// Returns the box around the seen voxels at the heights of flight, without the outermost few, and around the camera's
+/// path. [m, world]
 fn fence(seen: &Seen, floor_m: f64, ways: &[DVec3]) -> [DVec3; 2] {
     let mut along: [Vec<f64>; 3] = Default::default();
     each_seen(seen, |p| {
@@ -177,7 +177,8 @@ fn fence(seen: &Seen, floor_m: f64, ways: &[DVec3]) -> [DVec3; 2] {
     [min_m, max_m].map(|p| DVec3::from_array(p.to_array().map(to_cm)))
 }
 
-/// Returns places of the way to start at, on the floor below, the roomiest first; the vehicle looks where the camera did.
+/// Returns candidates for the start: on the floor below the camera's path, in the camera's heading, those with the most
+/// free space first.
 fn starts(
     way: &[Placed],
     floor_m: f64,
@@ -204,7 +205,7 @@ fn starts(
     starts.into_iter().map(|(_, start)| start).collect()
 }
 
-/// Returns how far the sides of the fence are. [m]
+/// Returns the horizontal distance to the nearest side of the fence. [m]
 fn beside_m(arena: &ArenaConfig, p: DVec3) -> f64 {
     let fence = &arena.geofence;
     (p - fence.min_m).truncate().min((fence.max_m - p).truncate()).min_element()
@@ -223,7 +224,7 @@ fn each_seen(seen: &Seen, mut take: impl FnMut(DVec3)) {
     }
 }
 
-/// Returns the share of a box's voxels that were seen; what is outside of the voxels was not.
+/// Returns the share of a box's voxels that were seen; space outside of the grid counts as unseen.
 fn share_within(seen: &Seen, min_m: DVec3, max_m: DVec3) -> f64 {
     let voxels = &seen.voxels;
     let index = |p: DVec3| ((p - voxels.min_m) / voxels.side_m).floor();
@@ -247,40 +248,40 @@ fn to_cm(value: f64) -> f64 {
 }
 
 const HEAD: &str = "\
-# Made by `vizflyt scene capture`: the fence goes around what the capture has seen, the start lies on its way.
-# Add [goal] and [[stages]]: docs/guides/scenes.md, course.md. A capture that is repeated leaves this file as you edit it.
+# Written by `vizflyt scene capture`: the fence surrounds the seen space, the start lies on the camera's path.
+# Add [goal] and [[stages]]: docs/guides/scenes.md, course.md. Repeating the capture keeps your edits of this file.
 ";
 const IDENTITY: Similarity =
     Similarity { scale: 1.0, rotation: glam::DQuat::IDENTITY, translation_m: DVec3::ZERO };
-/// Around what is dense. [m]
+/// Margin around core and path. [m]
 const REGION_M: f64 = 0.5;
-/// 5 MB of bits; some seconds of rays.
+/// Maximum number of voxels: 5 MB of bits, some seconds of ray casting.
 const MOST_VOXELS: f64 = 4e7;
-/// No finer than obstacles are baked. [m]
+/// Minimum side of a voxel; obstacles are not baked at a higher resolution. [m]
 const LEAST_SIDE_M: f64 = 0.05;
-/// cos(2 degrees): a plane that leans more is no floor of an upright world.
+/// cos(2 degrees): a plane with more tilt is not the floor of an upright world.
 const FLAT_COS: f64 = 0.999_390_827_019_095_7;
 /// Heights of flight above the floor. [m]
 const LOW_M: f64 = 0.3;
 const HIGH_M: f64 = 3.0;
-/// Share of what was seen that is farther out, at each end.
+/// Share of the seen voxels outside the fence, at each end of an axis.
 const OUTER: f64 = 0.02;
-/// Half a vehicle and some air. [m]
+/// Half a vehicle plus clearance. [m]
 const BODY_M: f64 = 0.4;
-/// The floor is above the fence's lower side by this. [m]
+/// Depth of the fence below the floor. [m]
 const BELOW_FLOOR_M: f64 = 0.5;
-/// Around a start. [m]
+/// Half size of the area around a start that should be seen. [m]
 const AROUND_M: DVec3 = DVec3::new(0.8, 0.8, 0.0);
-/// More room than this is as good. [m]
+/// Free space beyond this does not improve a start. [m]
 const ROOM_M: f64 = 1.5;
-/// Starts that are tried.
+/// Maximum number of tested starts.
 const STARTS: usize = 20;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// A grid of 10 x 10 x 10 voxels of 1 m, of which the lower half was seen.
+    /// Returns a grid of 10 x 10 x 10 voxels of 1 m, with the lower half seen.
     fn lower_half() -> Seen {
         let voxels = Voxels { min_m: DVec3::ZERO, side_m: 1.0, size: [10; 3] };
         let mut bits = vec![0u8; 125];
@@ -291,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn shares_count_what_is_outside_as_unseen() {
+    fn counts_space_outside_of_the_grid_as_unseen() {
         let seen = lower_half();
         let share =
             |low: f64, high: f64| share_within(&seen, DVec3::splat(low), DVec3::splat(high));
@@ -302,12 +303,12 @@ mod tests {
     }
 
     #[test]
-    fn the_fence_is_around_what_was_seen_and_the_way() {
+    fn the_fence_contains_seen_space_and_path() {
         let [min_m, max_m] = fence(&lower_half(), 1.0, &[DVec3::new(12.0, 5.0, 2.5)]);
         assert!(min_m.x < 0.6 && min_m.z == 0.5, "{min_m}");
         assert_eq!(max_m.x, 12.4);
         assert!(max_m.y > 9.4 && max_m.z <= 4.0, "{max_m}");
-        // Nothing seen: the way alone.
+        // Nothing seen: only the path.
         let nothing = Seen { bits: vec![0; 125], ..lower_half() };
         let [min_m, max_m] = fence(&nothing, 0.0, &[DVec3::new(1.0, 1.0, 1.4)]);
         assert_eq!((min_m, max_m), (DVec3::new(0.6, 0.6, -0.5), DVec3::new(1.4, 1.4, 1.8)));

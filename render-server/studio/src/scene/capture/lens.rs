@@ -1,4 +1,4 @@
-//! The lens that pictures were taken with: calibrated, or not known yet.
+//! Lens of the pictures: calibrated, or an initial guess.
 
 use std::path::Path;
 
@@ -6,18 +6,19 @@ use anyhow::{Result, ensure};
 use vizflyt_protocol::geometry::Intrinsics;
 use vizflyt_tags::camera::TagCamera;
 
-/// Reads a camera's file for pictures of a size.
+/// Reads a lens file and scales it to the size of the pictures.
 ///
 /// # Errors
-/// No such file, or a camera of another shape.
+/// The file cannot be read, or its aspect ratio differs.
 pub(super) fn read(path: &Path, size_px: [u32; 2]) -> Result<Intrinsics> {
     let k = TagCamera::read(path)?.intrinsics;
     let [width, height] = size_px.map(f64::from);
     let (across, down) = (width / f64::from(k.width_px), height / f64::from(k.height_px));
-    // A pixel was rounded away, at most.
+    // Tolerance for rounding the size by one pixel.
     ensure!(
         (across / down - 1.0).abs() <= 1.5 / width.min(height),
-        "{}: a camera of {} x {} pixels took no pictures of {} x {}: another shape; calibrate it as you film",
+        "{}: calibrated at {} x {} pixels, but the pictures have {} x {}, another aspect ratio; calibrate with the \
+         same video mode",
         path.display(),
         k.width_px,
         k.height_px,
@@ -35,9 +36,9 @@ pub(super) fn read(path: &Path, size_px: [u32; 2]) -> Result<Intrinsics> {
     })
 }
 
-/// Returns a phone's lens, as long as nothing is known of it.
+/// Returns a typical phone lens as the initial guess.
 pub(super) fn guess([width, height]: [u32; 2]) -> Intrinsics {
-    // The main lenses of phones see 62 to 72 degrees along the longer side.
+    // Main lenses of phones have a field of view of 62 to 72 degrees along the longer side.
     let long = width.max(height);
     let k = Intrinsics::from_horizontal_fov(long, long, 67f64.to_radians());
     Intrinsics {
@@ -54,7 +55,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lens_fits_pictures_of_its_shape() {
+    fn requires_pictures_of_the_same_aspect_ratio() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("camera.toml");
         let text = "name = \"phone\"\nwidth_px = 1920\nheight_px = 1080\nfx_px = 1500.0\nfy_px = 1501.0\n\
@@ -63,12 +64,12 @@ mod tests {
         let k = read(&path, [960, 540]).unwrap();
         assert_eq!((k.width_px, k.fx_px, k.cy_px), (960, 750.0, 270.0));
         let error = read(&path, [1080, 1920]).unwrap_err().to_string();
-        assert!(error.contains("another shape"), "{error}");
+        assert!(error.contains("another aspect ratio"), "{error}");
         assert!(read(&folder.path().join("none.toml"), [1, 1]).is_err());
     }
 
     #[test]
-    fn a_phone_that_is_held_upright_has_the_same_lens() {
+    fn guesses_the_same_lens_for_portrait_and_landscape() {
         let (level, upright) = (guess([1920, 1080]), guess([1080, 1920]));
         assert_eq!(level.fx_px, upright.fx_px);
         assert_eq!((upright.cx_px, upright.cy_px), (540.0, 960.0));

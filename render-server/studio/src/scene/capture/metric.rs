@@ -1,4 +1,4 @@
-//! The third stage: the largest model in metres, upright, with what is known of both; and the verdict on it.
+//! Fourth stage: converts the largest model to metres and upright axes, with their uncertainty, and judges the capture.
 
 mod ground;
 
@@ -22,29 +22,29 @@ use super::prints::Seen;
 use super::work::Fingerprint;
 use crate::scene::align::{self, ClockArgs};
 
-/// What is known of the room.
+/// Known data of the room and the camera.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Room {
-    /// Where tags stand.
+    /// Surveyed layout of the tags.
     pub(super) layout: Option<TagLayout>,
-    /// Edge of all tags, where nobody measured their places. [m]
+    /// Edge of all tags, if their positions are unknown. [m]
     pub(super) tag_size_m: Option<f64>,
-    /// How far apart the middles of two tags are.
+    /// Measured distance between the centres of two tags.
     pub(super) length: Option<Length>,
-    /// What a motion capture saw of the camera.
+    /// Motion capture track of the camera.
     pub(super) track: Option<Track>,
     /// Whether the lens was calibrated.
     pub(super) lens_is_known: bool,
 }
 
-/// A length that was measured between the middles of two tags.
+/// Measured distance between the centres of two tags.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(super) struct Length {
     pub(super) ids: [u32; 2],
     pub(super) metres: f64,
 }
 
-/// A motion capture's recording of the camera.
+/// File with the motion capture track of the camera, and its clock options.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct Track {
     file: PathBuf,
@@ -58,7 +58,7 @@ impl Track {
         Ok(Self { file: file.to_owned(), fingerprint, clocks: clocks.clone() })
     }
 
-    /// Finds where the adjusted cameras are.
+    /// Estimates the placement of the adjusted cameras in the room.
     fn fit(&self, pictures: &Pictures, capture: &Capture, adjusted: &Adjusted) -> Result<Fit> {
         let names: Vec<&str> = capture.images.iter().map(|image| image.name.as_str()).collect();
         let times_s = if pictures.of_video {
@@ -82,63 +82,63 @@ impl Track {
     }
 }
 
-/// What the stage leaves, beside the model in `sparse/0`.
+/// Result of the stage, in addition to the model in `sparse/0`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Metric {
-    /// Whether there is a model.
+    /// Whether a model was written.
     pub(super) has_model: bool,
-    /// What the metres are from, in words.
+    /// Source of the scale, in words.
     pub(super) scale_from: String,
-    /// Whether nothing measured tells the metres.
+    /// Whether the scale is guessed, because no measurement defines it.
     pub(super) scale_is_guessed: bool,
-    /// What the vertical is from, in words.
+    /// Source of the vertical axis, in words.
     pub(super) up_from: String,
-    /// Three sigmas, as a share of it.
+    /// Relative uncertainty of the scale, three sigmas.
     pub(super) scale_bound: Option<f64>,
-    /// Three sigmas. [degrees]
+    /// Uncertainty of the vertical axis, three sigmas. [degrees]
     pub(super) tilt_bound_deg: Option<f64>,
-    /// How far points are from where pictures saw them, root mean square. [px]
+    /// Reprojection error of the points, root mean square. [px]
     pub(super) points_rms_px: Option<f64>,
-    /// Of a video: how rows were exposed one after the other.
+    /// Rolling shutter of a video.
     #[serde(default)]
     pub(super) rolling_shutter: Option<RollingShutter>,
     pub(super) tags: Vec<TagFact>,
     pub(super) findings: Vec<FindingFact>,
-    /// What was looked at, a line each.
+    /// Results of the checks, one line each.
     pub(super) checked: Vec<String>,
-    /// Whether nothing refuses it.
+    /// Whether no check rejects the capture.
     pub(super) fit_to_fly: bool,
-    /// Placed pictures, in the order of time.
+    /// Placed pictures in order of time.
     pub(super) way: Vec<Placed>,
 }
 
-/// A picture that was placed.
+/// Pose of a placed picture.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Placed {
     pub(super) name: String,
     pub(super) at_s: f64,
     /// [m, world]
     pub(super) position_m: DVec3,
-    /// Where it looks. [world]
+    /// Viewing direction. [world]
     pub(super) ahead: DVec3,
 }
 
-/// How long it took to expose all rows of a picture, one after the other.
+/// Readout time of a rolling shutter.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct RollingShutter {
-    /// From the first row to the last; negative of a phone held upside down. [ms]
+    /// Time from the first to the last row; negative for a phone held upside down. [ms]
     pub(super) readout_ms: f64,
-    /// Three sigmas. [ms]
+    /// Uncertainty, three sigmas. [ms]
     pub(super) bound_ms: f64,
 }
 
 impl RollingShutter {
-    /// Returns it in words.
+    /// Returns the description for the report.
     pub(super) fn in_words(self) -> String {
         let Self { readout_ms, bound_ms } = self;
         if readout_ms.abs() <= bound_ms {
             return format!(
-                "none was found: rows are exposed together, to {bound_ms:.1} ms (three sigmas)"
+                "no rolling shutter: rows are exposed at the same time within {bound_ms:.1} ms (three sigmas)"
             );
         }
         let order = if readout_ms < 0.0 {
@@ -147,43 +147,43 @@ impl RollingShutter {
             "from the uppermost to the lowest"
         };
         format!(
-            "rows are exposed one after the other, {order} over {:.1} ms, to {bound_ms:.1} ms (three sigmas); places are \
+            "rows are exposed one after the other, {order} over {:.1} ms, +- {bound_ms:.1} ms (three sigmas); poses are \
              those of the middle row",
             readout_ms.abs()
         )
     }
 }
 
-/// How a tag fits.
+/// Fit of a tag.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct TagFact {
     pub(super) name: String,
-    /// Its middle; absent where too few pictures saw it. [m, world]
+    /// Centre; absent if too few pictures show the tag. [m, world]
     pub(super) position_m: Option<DVec3>,
     pub(super) sightings: usize,
     pub(super) contradicting: usize,
-    /// From where pictures saw it. [px]
+    /// Reprojection error of the corners. [px]
     pub(super) rms_px: Option<f64>,
-    /// From where it was measured to be, by all others. [m]
+    /// Distance between its surveyed position and its position estimated from the other tags. [m]
     pub(super) held_out_off_m: Option<f64>,
-    /// Its edges by all others, as a share of what they were measured to be, less 1.
+    /// Relative error of its edge length, estimated from the other tags.
     pub(super) held_out_size_error: Option<f64>,
 }
 
-/// What a person should know.
+/// Problem of a capture.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct FindingFact {
     pub(super) refused: bool,
-    /// Whether it is of scale and vertical alone: what is seen is right.
+    /// Whether only scale and vertical axis are affected, so that the images are still right.
     pub(super) of_metres: bool,
     pub(super) what: String,
     pub(super) remedy: String,
-    /// First and last of each run of pictures that are meant.
+    /// First and last index of each affected run of pictures.
     pub(super) images: Vec<[usize; 2]>,
 }
 
 impl Metric {
-    /// Returns what a person is told in a line.
+    /// Returns a summary of one line.
     pub(super) fn summary(&self) -> String {
         if !self.has_model {
             return "not metric".to_owned();
@@ -196,16 +196,16 @@ impl Metric {
         format!("scale {scale} by {}; up {tilt} by {}", self.scale_from, self.up_from)
     }
 
-    /// Whether splats that are trained from it show the room as it is, however large.
+    /// Whether a scene trained from the model shows the room correctly, except for its scale.
     pub(super) fn is_fit_to_train(&self) -> bool {
         self.has_model && self.findings.iter().all(|f| !f.refused || f.of_metres)
     }
 }
 
-/// Makes the first of the models metric, and judges it.
+/// Converts the first model to metres, and judges the capture.
 ///
 /// # Errors
-/// A model that cannot be read; what is wrong with the capture is no error.
+/// A model cannot be read. Problems of the capture are findings, not errors.
 pub(super) fn make(
     pictures: &Pictures,
     seen: &Seen,
@@ -216,13 +216,13 @@ pub(super) fn make(
     if let Some(layout) = &room.layout {
         ensure!(
             layout.frame == LayoutFrame::World,
-            "the layout of --tags is of tags on a vehicle (frame = \"body\"); give that of the room's"
+            "the layout of --tags is of tags on a vehicle (frame = \"body\"); give the layout of the room"
         );
     }
     let read = |folder: &Path| -> Result<SparseModel> {
         let mut model = colmap::read(folder)?;
         for image in &mut model.images {
-            // Below other folders in other programs.
+            // The folder part of the names differs between programs.
             if let Some(name) = Path::new(&image.name).file_name().and_then(|name| name.to_str()) {
                 image.name = name.to_owned();
             }
@@ -239,7 +239,7 @@ pub(super) fn make(
     let model = read(&poses.models[0].folder)?;
     let first = capture(&model)
         .with_context(|| format!("the model in {}", poses.models[0].folder.display()))?;
-    // A small one may be of other pictures altogether.
+    // Other models may be unreadable, or of other pictures.
     let others =
         poses.models[1..].iter().filter_map(|other| capture(&read(&other.folder).ok()?).ok());
     let others: Vec<Capture> = others.collect();
@@ -251,7 +251,7 @@ pub(super) fn make(
             at_s: pictures.of_video.then_some(picture.at_s),
         })
         .collect();
-    // Only a video's times say how the camera moved.
+    // Only videos have the times that a rolling shutter estimate needs.
     let options = Options {
         refine_lens: !room.lens_is_known,
         rolling: pictures.of_video,
@@ -285,7 +285,7 @@ pub(super) fn make(
     Ok(metric)
 }
 
-/// Adds the tags whose size or place is known, and where pictures saw them.
+/// Adds the tags of known size or position, and their sightings.
 fn add_tags(capture: &mut Capture, pictures: &Pictures, seen: &Seen, room: &Room) {
     let mut number = vec![None; seen.tags.len()];
     for (index, print) in seen.tags.iter().enumerate() {
@@ -359,7 +359,7 @@ fn describe(metric: &mut Metric, capture: &Capture, adjusted: &Adjusted, ground:
     }
 }
 
-/// Returns the model as it was adjusted, in metres and upright.
+/// Returns the adjusted model in metres and upright axes.
 fn placed(
     model: &SparseModel,
     capture: &Capture,
@@ -378,7 +378,7 @@ fn placed(
             image.world_from_cam = pose;
         }
     }
-    // In the order of their ids, as the capture has them.
+    // In order of their ids, as in the capture.
     let mut ids: Vec<u64> = placed.points.keys().copied().collect();
     ids.sort_unstable();
     for (id, &p_m) in ids.iter().zip(&adjusted.points_m) {
@@ -389,5 +389,5 @@ fn placed(
     placed
 }
 
-/// What a motion capture and a hand-held marker's place are good for. [m]
+/// Standard deviation of a motion capture and a hand-held marker. [m]
 const TRACK_SIGMA_M: f64 = 0.005;

@@ -1,14 +1,15 @@
-//! `vizflyt scene capture`: from a video of a room to a twin that can be flown.
+//! `vizflyt scene capture`: makes a flyable twin from a video or photos of a room.
 //!
 //! ```text
-//! images   the sharpest pictures of the video                     pictures
-//! tags     printed tags in them                                   -> which places are one, which pictures to compare
-//! poses    COLMAP or pycolmap, whichever is installed             -> models, of unknown size and turn
-//! metric   bundle adjustment with tags, verdict                   -> poses in metres, or what to film again
-//! train    splats, photos held out                                -> scene.ply
-//! finish   carved by the capture's rays; fence, start             -> scene.ply, arena.toml
+//! images   select the sharpest pictures of the video              -> pictures
+//! tags     detect printed tags                                    -> pictures of the same place, pairs to compare
+//! poses    COLMAP or pycolmap, whichever is installed             -> models of unknown scale and orientation
+//! metric   bundle adjustment with tags, verdict                   -> poses in metres, or advice what to film again
+//! train    train the splats, with held-out photos                 -> scene.ply
+//! finish   carve by the capture's rays; write fence and start     -> scene.ply, arena.toml
 //! ```
-//! Each keeps its result in `stages/` (`work.rs`); `capture.json` and `report.html` are written at the end, however it ends.
+//! Each stage stores its result in `stages/` (`work.rs`). `capture.json` and `report.html` are always written at the
+//! end, also after an error.
 
 mod coverage;
 mod finish;
@@ -41,17 +42,17 @@ use self::training::Schedule;
 use self::work::{Fingerprint, Stage, Work};
 use crate::scene::align::ClockArgs;
 
-/// Makes a twin that can be flown from a video of a room, or from photos of it.
+/// Make a flyable twin from a video or photos of a room
 #[derive(Args, Debug)]
-#[command(after_help = "What comes out, in the folder of -o:
-  scene.ply      the twin, in metres, z up; beside it scene.ply.seen: where photos looked, all else is solid
-  arena.toml     a fence around what was seen, a start on the walk; only if the capture can be trusted
-  report.html    the walk from above, what was found, photos beside what they are rendered as
-  capture.json   the same for programs: scale and its bound, residuals, times
-  stages/        what each stage made; a stage whose inputs are the same is not done again
+#[command(after_help = "Files in the output folder:
+  scene.ply      twin, in metres, z up; scene.ply.seen has the space that photos saw, the rest is solid
+  arena.toml     fence around the seen space, start on the walk; only if the capture is accepted
+  report.html    map of the walk, findings, photos next to their renderings
+  capture.json   the same for programs: scale and its uncertainty, residuals, times
+  stages/        results of the stages; a stage with unchanged inputs is not run again
 
-A video is read by the program ffmpeg. Where the camera was is found by COLMAP: `pip install pycolmap`, or the
-program colmap. Put up printed tags before you film: they make it metric, and they tell alike places apart.
+Videos require the program ffmpeg. Camera poses are estimated by COLMAP: `pip install pycolmap`, or the program
+colmap. Put up printed tags before you film: they define the scale, and distinguish places that look alike.
 
 Examples:
   vizflyt scene capture hall.mp4 -o my-hall --tags hall.tags.toml
@@ -62,56 +63,60 @@ Examples:
   vizflyt scene capture hall.mp4 -o my-hall --tags hall.tags.toml --from train --steps 7000 --width 640
   vizflyt demo --scene my-hall")]
 pub(crate) struct CaptureArgs {
-    /// A video, or a folder of photos of one camera
+    /// Video, or folder of photos of one camera
     input: PathBuf,
-    /// Folder that the twin goes to; made if absent, continued if it is of this command
+    /// Output folder; created if missing, an interrupted capture is resumed
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Where printed tags stand in the room: the layout, measured (`vizflyt tags print`)
+    /// Surveyed layout of printed tags in the room (`vizflyt tags print`)
     #[arg(long, value_name = "LAYOUT", conflicts_with_all = ["tag_size", "length"])]
     tags: Option<PathBuf>,
-    /// Edge of the black square of all tags, where nobody measured their places [m]
+    /// Edge of the black square of all tags, if their positions are unknown [m]
     #[arg(long, value_name = "METRES", value_parser = metres)]
     tag_size: Option<f64>,
-    /// Two tags, by number, and how far apart their middles are [m]
+    /// Numbers of two tags, and the distance between their centres [m]
     #[arg(long, value_name = "A,B=METRES", value_parser = length)]
     length: Option<Length>,
-    /// A motion capture's track of something fixed to the camera while it filmed; gives metres, up and the room's frame
+    /// Motion capture track of a marker fixed to the camera during the capture
+    ///
+    /// Defines scale, vertical axis and frame of the room.
     #[arg(long, value_name = "CSV", conflicts_with_all = ["tags", "tag_size", "length"])]
     track: Option<PathBuf>,
     #[command(flatten)]
     clocks: ClockArgs,
-    /// The camera's lens, as `vizflyt tags calibrate` writes it; found from the pictures where it is absent
+    /// Lens file of `vizflyt tags calibrate` [default: estimated from the pictures]
     #[arg(long, value_name = "CAMERA")]
     camera: Option<PathBuf>,
-    /// Poses that exist already: a folder of COLMAP, of the photos in INPUT
+    /// Existing poses of the photos in INPUT: a folder of COLMAP
     #[arg(long, value_name = "DATASET")]
     poses: Option<PathBuf>,
-    /// A Python that has pycolmap
+    /// Python interpreter with pycolmap
     #[arg(long, value_name = "PROGRAM", conflicts_with = "poses")]
     python: Option<PathBuf>,
-    /// How many pictures to take of a video; without, three a second, 80 to 300
+    /// Number of pictures from a video [default: 3 per second, from 80 to 300]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(8..=2000))]
     frames: Option<u16>,
-    /// Wider pictures of a video are made smaller [px]
+    /// Maximum width of pictures; wider ones of a video are downscaled [px]
     #[arg(long, value_name = "PX", default_value_t = 1920, value_parser = clap::value_parser!(u32).range(160..=8192))]
     picture_width: u32,
-    /// Steps of the training
+    /// Number of training steps
     #[arg(long, default_value_t = 3000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     steps: u32,
-    /// The most splats
+    /// Maximum number of splats
     #[arg(long, default_value_t = 60_000, value_name = "N", value_parser = clap::value_parser!(u32).range(1000..=20_000_000))]
     splats: u32,
-    /// Width that pictures are trained with [px]
+    /// Width of the pictures for training [px]
     #[arg(long, default_value_t = 320, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     width: u32,
-    /// Same pictures, same poses, same seed: the same twin on the same kind of processor
+    /// Random seed
+    ///
+    /// The same pictures, poses and seed give the same twin on the same kind of processor.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Does this stage and all after it again, though nothing has changed
+    /// Re-run from this stage even if its inputs are unchanged
     #[arg(long, value_name = "STAGE")]
     from: Option<Stage>,
-    /// Trains, and writes an arena.toml, though the capture is refused
+    /// Train and write an arena.toml even if the capture is rejected
     #[arg(long)]
     force: bool,
 }
@@ -121,11 +126,11 @@ pub(crate) fn run(args: &CaptureArgs) -> Result<ExitCode> {
     let source = Source::of(&args.input)?;
     ensure!(
         args.poses.is_none() || matches!(source, Source::Folder(_)),
-        "--poses are of photos: give the folder of the pictures in place of the video"
+        "--poses is for photos: give the folder of the pictures instead of the video"
     );
     ensure!(
         !args.clocks.has_times() || matches!(source, Source::Folder(_)),
-        "--times and --rate are of photos; a video has its own times"
+        "--times and --rate are for photos; a video has its own times"
     );
     let layout = args.tags.as_deref().map(TagLayout::read).transpose()?;
     let mut work = Work::open(&args.output, args.from)?;
@@ -137,7 +142,7 @@ pub(crate) fn run(args: &CaptureArgs) -> Result<ExitCode> {
         Ok(made) => made,
         Err(error) => {
             record.failure = Some(Failure::new(&error, &args.output, &work));
-            // Why it stopped is said in any case: by the error itself.
+            // The caller prints the error itself in any case.
             match record.write(&args.output, &work) {
                 Ok(()) => print_fmt!("report      {}", args.output.join("report.html").display()),
                 Err(cause) => print_fmt!("no report   {cause:#}"),
@@ -153,7 +158,7 @@ pub(crate) fn run(args: &CaptureArgs) -> Result<ExitCode> {
     Ok(if made { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// Checks that what reads the video and finds poses is installed: not only after the video was read.
+/// Checks that ffmpeg and COLMAP are installed before the video is read.
 fn check_programs(args: &CaptureArgs, source: &Source, work: &Work) -> Result<()> {
     if let Source::Video(file) = source {
         images::probe(file)?;
@@ -164,7 +169,7 @@ fn check_programs(args: &CaptureArgs, source: &Source, work: &Work) -> Result<()
     Ok(())
 }
 
-/// Does the stages; returns whether all of them were, and the result can be flown.
+/// Runs the stages. Returns whether all of them ran and the result can be flown.
 fn make(
     args: &CaptureArgs,
     source: &Source,
@@ -213,10 +218,10 @@ fn make(
         [] => String::new(),
         others => {
             let sizes: Vec<String> = others.iter().map(|model| model.placed.to_string()).collect();
-            format!("; apart from them {}", sizes.join(", "))
+            format!("; other models: {}", sizes.join(", "))
         }
     };
-    work.say(&format!("{placed} pictures placed together by {}{more}", poses.tool));
+    work.say(&format!("{placed} pictures placed by {}{more}", poses.tool));
     record.poses = Some(poses.clone());
 
     let room = Room {
@@ -238,7 +243,7 @@ fn make(
     let fit_to_fly = metric.fit_to_fly;
     record.metric = Some(metric.clone());
     if !(fit_to_train || args.force && metric.has_model) {
-        print_fmt!("stopped     before training: what is seen would be wrong, not only small");
+        print_fmt!("stopped     before training: the scene would be wrong, not only its scale");
         remove_arena(&args.output, work)?;
         return Ok(false);
     }
@@ -275,7 +280,7 @@ fn make(
         let (low, high) = (largest.min_m, largest.max_m);
         let all_m2: f64 = finished.unseen.iter().map(|area| area.area_m2).sum();
         print_fmt!(
-            "unseen      {all_m2:.0} m2 from above, solid to the referee; most within {:.1}, {:.1} to {:.1}, {:.1}",
+            "unseen      {all_m2:.0} m2 from above, solid for the referee; largest area within {:.1}, {:.1} to {:.1}, {:.1}",
             low.x,
             low.y,
             high.x,
@@ -296,7 +301,7 @@ fn make(
     } else {
         remove_arena(&args.output, work)?;
         print_fmt!(
-            "no arena    it can be looked at: vizflyt scene view {}",
+            "no arena    only for viewing: vizflyt scene view {}",
             args.output.join("scene.ply").display()
         );
     }
@@ -311,13 +316,13 @@ fn make(
     Ok(fit_to_fly && can_start)
 }
 
-/// Copies what a stage made to where people look for it.
+/// Copies a file of a stage to the output folder.
 fn copy(from: &Path, to: &Path) -> Result<()> {
     std::fs::copy(from, to).with_context(|| format!("cannot write {}", to.display()))?;
     Ok(())
 }
 
-/// Writes arena.toml, unless somebody has edited it since.
+/// Writes arena.toml, unless a user has edited the existing one.
 fn write_arena(output: &Path, work: &Work) -> Result<()> {
     let (path, made) = (output.join("arena.toml"), work.folder(Stage::Finish).join("arena.toml"));
     if path.exists() && !is_ours(&path, work) {
@@ -333,7 +338,7 @@ fn write_arena(output: &Path, work: &Work) -> Result<()> {
     std::fs::write(&mark, digest(&path)).with_context(|| format!("cannot write {}", mark.display()))
 }
 
-/// Takes away the arena.toml of an earlier run: what is refused now shall not be flown by it.
+/// Removes the arena.toml of an earlier run, so that a rejected capture cannot be flown.
 fn remove_arena(output: &Path, work: &Work) -> Result<()> {
     let path = output.join("arena.toml");
     if !path.exists() {
@@ -343,22 +348,22 @@ fn remove_arena(output: &Path, work: &Work) -> Result<()> {
         return std::fs::remove_file(&path)
             .with_context(|| format!("cannot remove {}", path.display()));
     }
-    print_fmt!("kept        {} was edited and stays, but this capture is refused", path.display());
+    print_fmt!("kept        {} was edited and stays, but this capture is rejected", path.display());
     Ok(())
 }
 
-/// Whether a file is as [`write_arena`] left it.
+/// Whether a file is unchanged since [`write_arena`].
 fn is_ours(path: &Path, work: &Work) -> bool {
     std::fs::read_to_string(work.mark()).is_ok_and(|mark| mark == digest(path))
 }
 
-/// Returns the hash of a file; of one that cannot be read, nothing.
+/// Returns the hash of a file; empty if it cannot be read.
 fn digest(path: &Path) -> String {
     let hash = std::fs::read(path).map(Sha256::digest);
     hash.map_or(String::new(), |hash| hex(&hash))
 }
 
-/// Returns the folder's name as an arena's.
+/// Returns a valid arena name from the name of the folder.
 fn arena_name(output: &Path) -> String {
     let name = output.canonicalize().ok();
     let name =
@@ -367,21 +372,21 @@ fn arena_name(output: &Path) -> String {
     if name.is_empty() { "scene".to_owned() } else { name }
 }
 
-/// Returns what tells a lens from another.
+/// Returns the cache key of a lens.
 fn lens_key(k: &vizflyt_protocol::geometry::Intrinsics) -> String {
     format!("{k:?}")
 }
 
 fn metres(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| format!("'{text}' is no number"))?;
+    let value: f64 = text.parse().map_err(|_| format!("'{text}' is not a number"))?;
     if value > 0.0 && value <= 1000.0 {
         return Ok(value);
     }
-    Err(format!("{value} m is no length between 0 and 1000 m"))
+    Err(format!("{value} m is not a length between 0 and 1000 m"))
 }
 
 fn length(text: &str) -> Result<Length, String> {
-    let wrong = || format!("'{text}' is no length between two tags; write it as 3,8=4.52");
+    let wrong = || format!("'{text}' is not a length between two tags; write it as 3,8=4.52");
     let (ids, value) = text.split_once('=').ok_or_else(wrong)?;
     let (a, b) = ids.split_once(',').ok_or_else(wrong)?;
     let id = |text: &str| text.trim().parse::<u32>().map_err(|_| wrong());
@@ -397,7 +402,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lengths_are_read() {
+    fn parses_lengths() {
         assert_eq!(length("3,8=4.52"), Ok(Length { ids: [3, 8], metres: 4.52 }));
         for wrong in ["3,8", "3=4", "3,3=1", "a,8=4", "3,8=-1", "3,8=inf", "3,8=x", ""] {
             assert!(length(wrong).is_err(), "{wrong}");
@@ -405,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn an_arena_that_was_edited_stays() {
+    fn keeps_an_edited_arena() {
         let folder = tempfile::tempdir().unwrap();
         let output = folder.path().join("hall");
         let work = Work::open(&output, None).unwrap();

@@ -1,4 +1,4 @@
-//! `report.html`: one page, without anything from elsewhere.
+//! `report.html`: one page without external resources.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -9,7 +9,7 @@ use vizflyt_server::web::top_view::base64;
 use super::coverage::{escaped, span, svg};
 use super::record::Record;
 
-/// Returns the page. Pictures lie in `trained`.
+/// Returns the page, with the images of the folder `trained`.
 pub(super) fn html(record: &Record, points: &[DVec3], trained: &Path) -> String {
     let mut page = String::from(HEAD);
     let title = escaped(&record.source);
@@ -24,8 +24,8 @@ pub(super) fn html(record: &Record, points: &[DVec3], trained: &Path) -> String 
             let _ = write!(
                 page,
                 "<h2>The walk from above</h2><p>Blue at its beginning, red at its end; short lines show where the camera \
-                 looked, squares are tags, grey are points of the room. Broken red lines: nothing was placed there. Brown: within the fence and not seen \
-                 at the heights of flight; solid to the referee, film there too.</p>\
+                 looked, squares are tags, grey dots are points of the room. Dashed red lines: no picture was placed there. Brown: unseen space within the fence \
+                 at the heights of flight; solid for the referee, film there too.</p>\
                  <div class=map>{map}</div>"
             );
         }
@@ -52,9 +52,9 @@ fn verdict(page: &mut String, record: &Record) {
         (true, _) => ("go", "It can be flown."),
         (false, Some(metric)) if !metric.fit_to_fly => ("no", "It is refused."),
         (false, Some(_)) if record.finished.is_some() => {
-            ("no", "Its place is right, its start is not: correct arena.toml.")
+            ("no", "The alignment is good, but the start is not: correct arena.toml.")
         }
-        _ => ("no", "It is not done."),
+        _ => ("no", "It is not complete."),
     };
     if record.failure.is_none() {
         let _ = write!(page, "<p class=\"verdict {class}\">{word}</p>");
@@ -110,7 +110,7 @@ fn facts(page: &mut String, record: &Record) {
         let tilt = metric.tilt_bound_deg.map(|deg| format!("to {deg:.2} degrees (three sigmas)"));
         row("up", format!("{}, by {}", bound(tilt, "unknown"), metric.up_from));
         if let Some(rms_px) = metric.points_rms_px {
-            row("points", format!("{rms_px:.2} px from where pictures saw them (rms)"));
+            row("points", format!("reprojection error {rms_px:.2} px (rms)"));
         }
         if let Some(shutter) = metric.rolling_shutter {
             row("shutter", shutter.in_words());
@@ -136,7 +136,7 @@ fn facts(page: &mut String, record: &Record) {
         }
     }
     if let Some(finished) = &record.finished {
-        row("carved", format!("{} splats taken away, {} left", finished.carved, finished.splats));
+        row("carved", format!("{} splats removed, {} left", finished.carved, finished.splats));
         let size_m = finished.fence_max_m - finished.fence_min_m;
         row(
             "fence",
@@ -164,7 +164,7 @@ fn tags(page: &mut String, record: &Record) {
         return;
     };
     page.push_str(
-        "<h2>Tags</h2><table class=grid><tr><th>tag<th>seen by<th>off [px]<th>by the others: off [cm]<th>size [%]\
+        "<h2>Tags</h2><table class=grid><tr><th>tag<th>pictures<th>error [px]<th>held out: error [cm]<th>size [%]\
          <th>contradicting</tr>",
     );
     let number = |value: Option<f64>, factor: f64, digits: usize| {
@@ -187,7 +187,7 @@ fn tags(page: &mut String, record: &Record) {
 
 fn samples(page: &mut String, record: &Record, trained: &Path) {
     let Some(samples) = record.trained.as_ref().map(|trained| &trained.samples) else { return };
-    page.push_str("<h2>Photos that training did not see, and the twin</h2><div class=pairs>");
+    page.push_str("<h2>Held-out photos and their renderings</h2><div class=pairs>");
     for (k, sample) in samples.iter().enumerate() {
         let picture = |kind: &str| {
             let bytes = std::fs::read(trained.join(format!("{kind}-{k}.jpg"))).unwrap_or_default();
@@ -209,7 +209,7 @@ fn samples(page: &mut String, record: &Record, trained: &Path) {
 fn stages(page: &mut String, record: &Record) {
     page.push_str("<h2>Times</h2><table class=grid><tr><th>stage<th>seconds</tr>");
     for time in &record.stages {
-        let kept = if time.kept { " (kept from an earlier run)" } else { "" };
+        let kept = if time.kept { " (from an earlier run)" } else { "" };
         let _ = write!(page, "<tr><td>{}<td>{:.1}{kept}</tr>", time.stage, time.seconds);
     }
     let _ = write!(page, "</table><p class=at>{}</p>", escaped(&record.made_by));
@@ -238,7 +238,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_refused_is_said_first_and_nothing_is_markup() {
+    fn shows_the_rejection_first_and_escapes_all_text() {
         let mut record = Record::new(Path::new("<hall>.mp4"));
         let finding = FindingFact {
             refused: true,
@@ -251,9 +251,9 @@ mod tests {
         let page = html(&record, &[], Path::new("nowhere"));
         assert!(page.contains("It is refused.") && page.contains("walk there again"), "{page}");
         assert!(!page.contains("<hall>") && !page.contains("<i>"), "{page}");
-        assert!(!page.contains("http://") && !page.contains("https://"), "it asks nobody");
+        assert!(!page.contains("http://") && !page.contains("https://"), "no external resources");
         record.metric = None;
-        assert!(html(&record, &[], Path::new("nowhere")).contains("It is not done."));
+        assert!(html(&record, &[], Path::new("nowhere")).contains("It is not complete."));
         record.failure = Some(Failure {
             stage: Some(Stage::Poses),
             what: "pycolmap <failed>".to_owned(),
@@ -264,6 +264,6 @@ mod tests {
             page.contains("It stopped in its stage poses.") && page.contains("film slowly."),
             "{page}"
         );
-        assert!(!page.contains("<failed>") && !page.contains("It is not done."), "{page}");
+        assert!(!page.contains("<failed>") && !page.contains("It is not complete."), "{page}");
     }
 }

@@ -1,4 +1,4 @@
-//! Printed tags in pictures: their numbers say which places are one, their corners how large that place is.
+//! Printed tags in pictures. Their numbers identify places, and their corners define the scale.
 
 use std::path::Path;
 
@@ -13,18 +13,18 @@ use vizflyt_tags::family::TagFamily;
 use super::images::Pictures;
 use crate::scene::progress::Progress;
 
-/// The tags that pictures show.
+/// Tags in all pictures.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Seen {
-    /// Each that any picture shows.
+    /// Distinct tags.
     pub(super) tags: Vec<Print>,
-    /// Of each picture, in their order.
+    /// Sightings in each picture, in their order.
     pub(super) pictures: Vec<Vec<Sighting>>,
-    /// Names of the pictures, in their order.
+    /// Names of the pictures, in the same order.
     pub(super) names: Vec<String>,
 }
 
-/// A printed tag.
+/// Identity of a printed tag.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Print {
     pub(super) family: TagFamily,
@@ -34,33 +34,33 @@ pub(super) struct Print {
 /// A tag in a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Sighting {
-    /// Which of [`Seen::tags`].
+    /// Index in [`Seen::tags`].
     pub(super) tag: usize,
-    /// Lower left, lower right, upper right, upper left. [px]
+    /// Corners: lower left, lower right, upper right, upper left. [px]
     pub(super) corners_px: [[f64; 2]; 4],
 }
 
 impl Sighting {
-    /// Returns its corners. [px]
+    /// Returns the corners as vectors. [px]
     pub(super) fn corners(&self) -> [DVec2; 4] {
         self.corners_px.map(DVec2::from_array)
     }
 }
 
 impl Seen {
-    /// Returns the tags in a picture, by its name.
+    /// Returns the tags in the picture with this name.
     pub(super) fn of(&self, name: &str) -> &[Sighting] {
         let index = self.names.iter().position(|known| known == name);
         index.and_then(|index| self.pictures.get(index)).map_or(&[], Vec::as_slice)
     }
 
-    /// Returns how many pictures show a tag.
+    /// Returns the number of pictures with tags.
     pub(super) fn with_tags(&self) -> usize {
         self.pictures.iter().filter(|tags| !tags.is_empty()).count()
     }
 }
 
-/// Looks for tags in all pictures. `lens` says how edges bend.
+/// Detects tags in all pictures. `lens` provides the distortion of straight edges.
 pub(super) fn look(pictures: &Pictures, families: &[TagFamily], lens: &Intrinsics) -> Result<Seen> {
     let mut detector = Detector::new(families, DetectorSettings::default());
     let mut progress = Progress::new("");

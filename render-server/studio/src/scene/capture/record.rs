@@ -1,4 +1,4 @@
-//! `capture.json`: how a twin was made, and how well it is known.
+//! `capture.json`: record of a capture, with its accuracy.
 
 use std::path::Path;
 
@@ -15,18 +15,18 @@ use super::poses::Poses;
 use super::training::Trained;
 use super::work::{Stage, StageTime, Work};
 
-/// What is known of a capture; what did not come is absent.
+/// Record of a capture; results of stages that did not run are absent.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Record {
-    /// 1; another where a field changes its meaning.
+    /// Format version: 1. It changes if a field changes its meaning.
     pub(super) version: u32,
-    /// The program and its version.
+    /// Program and version.
     pub(super) made_by: String,
-    /// What was filmed.
+    /// Path of the input.
     pub(super) source: String,
-    /// Whether it can be flown.
+    /// Whether the twin can be flown.
     pub(super) fit_to_fly: bool,
-    /// What stopped it.
+    /// Error that stopped the capture.
     pub(super) failure: Option<Failure>,
     pub(super) stages: Vec<StageTime>,
     pub(super) remarks: Vec<String>,
@@ -37,45 +37,45 @@ pub(super) struct Record {
     pub(super) finished: Option<Finished>,
 }
 
-/// What stopped a capture, and what to do.
+/// Error that stopped a capture, and advice.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct Failure {
-    /// Which stage; absent if none had begun.
+    /// Stage of the error; absent if none had begun.
     pub(super) stage: Option<Stage>,
     pub(super) what: String,
     pub(super) remedy: String,
 }
 
 impl Failure {
-    /// Describes an error, given what has come so far.
+    /// Describes an error, with advice for its stage.
     pub(super) fn new(error: &anyhow::Error, output: &Path, work: &Work) -> Self {
         let stage = work.running();
         let advice = match stage {
-            None => "nothing was begun: mend this, then give the same command again",
+            None => "no stage was started: correct this, then run the same command again",
             Some(Stage::Images) => {
-                "look whether the video plays to its end, or give a folder of photos of one camera"
+                "check that the video plays to its end, or give a folder of photos of one camera"
             }
             Some(Stage::Poses) => {
-                "what the program said is in stages/poses/log.txt; if it places too little, film slowly, sideways past \
-                 what has texture, with tags in view"
+                "the output of the program is in stages/poses/log.txt; if it places too few pictures, film slowly, sideways past \
+                 textured surfaces, with tags in view"
             }
             Some(Stage::Tags | Stage::Metric | Stage::Train | Stage::Finish) => {
-                "mend this, then give the same command again"
+                "correct this, then run the same command again"
             }
         };
         let mut remedy = advice.to_owned();
         if work.times().iter().any(|time| time.stage != Stage::Images) {
-            remedy += "; the stages before are kept, and not done again";
+            remedy += "; completed stages are not run again";
         }
         if output.join("arena.toml").exists() {
-            remedy += "; scene.ply and arena.toml in this folder are of an earlier run";
+            remedy += "; scene.ply and arena.toml in this folder are from an earlier run";
         }
         Self { stage, what: format!("{error:#}"), remedy }
     }
 }
 
 impl Record {
-    /// Begins with nothing.
+    /// Returns an empty record.
     pub(super) fn new(input: &Path) -> Self {
         Self {
             version: 1,

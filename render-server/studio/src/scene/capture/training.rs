@@ -1,4 +1,4 @@
-//! The fourth stage: splats, trained on the metric model, and photos beside what they are rendered as.
+//! Fifth stage: trains splats on the metric model, and writes held-out photos with their renderings.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use vizflyt_twin::{Dataset, Options, Trainer};
 use super::images::Pictures;
 use crate::scene::progress::Progress;
 
-/// How to train.
+/// Settings of the training.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(super) struct Schedule {
     pub(super) steps: u32,
@@ -22,7 +22,7 @@ pub(super) struct Schedule {
     pub(super) seed: u64,
 }
 
-/// What the stage leaves, beside `scene.ply`.
+/// Result of the stage, in addition to `scene.ply`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Trained {
     pub(super) photos: usize,
@@ -30,13 +30,13 @@ pub(super) struct Trained {
     pub(super) height_px: usize,
     pub(super) steps: u32,
     pub(super) splats: usize,
-    /// Photos that training did not see.
+    /// Quality on held-out photos.
     pub(super) held_out: Option<HeldOut>,
-    /// Some of them, for people to look at.
+    /// Some of the held-out photos, for the report.
     pub(super) samples: Vec<Sample>,
 }
 
-/// Means over photos that training did not see.
+/// Mean quality over held-out photos.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct HeldOut {
     pub(super) photos: usize,
@@ -44,14 +44,14 @@ pub(super) struct HeldOut {
     pub(super) ssim: f64,
 }
 
-/// A photo that training did not see; `photo-NAME` and `render-NAME` in the stage's folder.
+/// Held-out photo, stored as `photo-N.jpg` and `render-N.jpg` in the stage's folder.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Sample {
     pub(super) name: String,
     pub(super) psnr_db: f64,
 }
 
-/// Trains by the model in `metric`.
+/// Trains a scene with the model in `metric`.
 pub(super) fn train(
     pictures: &Pictures,
     metric: &Path,
@@ -101,7 +101,7 @@ pub(super) fn read(pictures: &Pictures, metric: &Path, width_px: u32) -> Result<
     Ok(Dataset::of_model(&model, &pictures.folder, Some(width_px))?)
 }
 
-/// Writes some held-out photos and what they are rendered as, evenly over the walk.
+/// Writes some held-out photos and their renderings, evenly over the walk.
 fn samples(dataset: &Dataset, trainer: &mut Trainer<'_>, folder: &Path) -> Result<Vec<Sample>> {
     let held_out = trainer.held_out();
     let count = held_out.len().min(SAMPLES);
@@ -127,8 +127,8 @@ fn write(path: &Path, rgb: &[u8], size: [usize; 2]) -> Result<()> {
     std::fs::write(path, bytes).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Every so many-th photo is held out.
+/// One of this number of photos is held out.
 const HOLD_OUT: usize = 8;
-/// More are not looked at.
+/// Maximum number of samples in the report.
 const SAMPLES: usize = 6;
 const JPEG_QUALITY: u8 = 90;

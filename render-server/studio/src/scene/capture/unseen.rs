@@ -1,21 +1,22 @@
-//! Where photos did not look at the heights of flight: the referee takes it for solid, and a person films there again.
+//! Unseen areas at the heights of flight: solid for the referee, and shown in the report so that a user films there.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// A connected part of the fence, from above.
+/// Connected unseen area, from above.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Area {
-    /// Its box. [m, world]
+    /// Minimum corner. [m, world]
     pub(super) min_m: DVec2,
     pub(super) max_m: DVec2,
-    /// How large it is. [m²]
+    /// Area. [m²]
     pub(super) area_m2: f64,
-    /// What it is made of: from x, to x, from y, [`CELL_M`] wide. [m, world]
+    /// Rows of the area: minimum x, maximum x, minimum y; each is [`CELL_M`] wide. [m, world]
     pub(super) rows_m: Vec<[f64; 3]>,
 }
 
-/// Returns the areas of a box in which less than half of each column was seen, by `share` of a box, the largest first.
+/// Returns the areas in which less than half of each column was seen, the largest first. `share` returns the seen share
+/// of a box.
 pub(super) fn areas(min_m: DVec3, max_m: DVec3, share: impl Fn(DVec3, DVec3) -> f64) -> Vec<Area> {
     let cells = ((max_m - min_m).truncate() / CELL_M).ceil().max(DVec2::ONE);
     let (width, height) = (cells.x as usize, cells.y as usize);
@@ -61,7 +62,7 @@ pub(super) fn areas(min_m: DVec3, max_m: DVec3, share: impl Fn(DVec3, DVec3) -> 
 }
 
 impl Area {
-    /// Takes cells in ascending order, row after row.
+    /// Returns the area of cells, which must be in ascending order, row by row.
     fn of(cells: &[usize], width: usize, corner: impl Fn(usize, usize) -> DVec2) -> Self {
         let mut area = Self {
             min_m: DVec2::INFINITY,
@@ -86,13 +87,13 @@ impl Area {
     }
 }
 
-/// Side of a column: as wide as a vehicle. [m]
+/// Width of a column, about that of a vehicle. [m]
 pub(super) const CELL_M: f64 = 0.25;
-/// A column is seen if this share of it is: what stands in it is not seen either.
+/// Minimum seen share of a seen column. It is below 1, because the inside of objects is never seen.
 const SEEN: f64 = 0.5;
-/// Smaller ones are chairs. [m²]
+/// Minimum size of a reported area; smaller ones are furniture. [m²]
 const LEAST_M2: f64 = 0.5;
-/// A square kilometre.
+/// Maximum number of columns: a square kilometre.
 const MOST_CELLS: usize = 16_000_000;
 
 #[cfg(test)]
@@ -100,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn corners_that_were_not_seen_are_apart_and_the_largest_is_first() {
+    fn finds_separate_areas_and_sorts_them_by_size() {
         let (min_m, max_m) = (DVec3::new(-1.0, 2.0, 0.0), DVec3::new(5.0, 8.0, 3.0));
         let is_unseen = |p: DVec2| {
             let corner = p.x < 0.0 && p.y < 3.0;
@@ -125,7 +126,7 @@ mod tests {
         assert_eq!(found[1].rows_m[0], [-1.0, 0.0, 2.0]);
         assert_eq!(found[1].rows_m.len(), 4);
         assert!(areas(min_m, max_m, |_, _| 1.0).is_empty());
-        // All of it: rows do not run on into the next.
+        // Everything unseen: rows do not continue in the next row.
         let all = areas(min_m, max_m, |_, _| 0.0);
         assert_eq!((all.len(), all[0].rows_m.len(), all[0].area_m2), (1, 24, 36.0));
         assert!(all[0].rows_m.iter().all(|row| (row[0], row[1]) == (-1.0, 5.0)));

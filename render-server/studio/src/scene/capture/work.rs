@@ -1,11 +1,11 @@
-//! The folder that a capture grows in: each stage's result is kept with a key of what it was made from, and taken
-//! again as long as that is the same.
+//! Stages of a capture and their cache. Each result is stored with a key of its inputs, and reused while the key is the
+//! same.
 //!
 //! ```text
 //! my-hall/stages/images/          files of the stage `images`
-//! my-hall/stages/images.json      its key, how long it took, its result; written last
+//! my-hall/stages/images.json      key, duration and result; written last
 //! ```
-//! A stage's key holds the keys of those before it: one that is done again lets all after it be done again.
+//! The key of a stage includes the keys of the previous stages. After a stage that runs again, all later ones do too.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -19,21 +19,21 @@ use sha2::{Digest, Sha256};
 use vizflyt_process::print_fmt;
 use vizflyt_trust::hex;
 
-/// What is done, in this order.
+/// Stages in their order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Stage {
-    /// Sharp pictures of a video
+    /// Select sharp pictures of the video
     Images,
-    /// Printed tags in them
+    /// Detect printed tags
     Tags,
-    /// Where they were taken from
+    /// Estimate the camera poses
     Poses,
-    /// The same in metres, and whether that is true
+    /// Determine and verify scale and axes, in metres
     Metric,
-    /// Splats
+    /// Train the splats
     Train,
-    /// What can be flown, and the report
+    /// Write fence, start and report
     Finish,
 }
 
@@ -56,29 +56,29 @@ impl fmt::Display for Stage {
     }
 }
 
-/// How long a stage took, and whether that was now.
+/// Duration of a stage, and whether its result was reused.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct StageTime {
     pub(super) stage: Stage,
     pub(super) seconds: f64,
-    /// Whether an earlier run did it.
+    /// Whether the result is from an earlier run.
     pub(super) kept: bool,
 }
 
-/// The folder, and how far the stages have come.
+/// Folder and progress of the stages.
 #[derive(Debug)]
 pub(super) struct Work {
     folder: PathBuf,
-    /// Done again from here on, whatever is kept.
+    /// Stages from this one on run again, even if results are stored.
     from: Option<Stage>,
-    /// Of the last stage.
+    /// Key of the last stage.
     key: String,
     times: Vec<StageTime>,
-    /// The stage that is being done.
+    /// Running stage.
     running: Option<Stage>,
 }
 
-/// A stage's file.
+/// Content of a stage's JSON file.
 #[derive(Serialize, Deserialize)]
 struct Kept<T> {
     key: String,
@@ -87,10 +87,10 @@ struct Kept<T> {
 }
 
 impl Work {
-    /// Opens the folder of a capture; makes it where it is absent.
+    /// Opens the folder of a capture, and creates it if it is missing.
     ///
     /// # Errors
-    /// A folder that holds something else.
+    /// The folder contains other files.
     pub(super) fn open(output: &Path, from: Option<Stage>) -> Result<Self> {
         let folder = output.join("stages");
         let is_new = !folder.is_dir();
@@ -99,7 +99,7 @@ impl Work {
                 .with_context(|| format!("cannot read the folder {}", output.display()))?;
             ensure!(
                 entries.next().is_none(),
-                "{} holds something that no capture has written; give another folder to -o",
+                "{} contains files that are not of a capture; give another folder to -o",
                 output.display()
             );
         }
@@ -113,18 +113,18 @@ impl Work {
         self.folder.join(stage.name())
     }
 
-    /// Whether a stage's result is kept, of whatever inputs, and will be looked at.
+    /// Whether a result of the stage is stored (for any inputs) and may be reused.
     pub(super) fn has(&self, stage: Stage) -> bool {
         self.from.is_none_or(|from| stage < from)
             && self.folder.join(format!("{stage}.json")).is_file()
     }
 
-    /// Returns the file that tells whether arena.toml was edited.
+    /// Returns the file with the hash of the written arena.toml, to detect edits.
     pub(super) fn mark(&self) -> PathBuf {
         self.folder.join("arena.sha256")
     }
 
-    /// Says what the last stage made, and how long that took.
+    /// Prints the result and the duration of the last stage.
     pub(super) fn say(&self, made: &str) {
         if let Some(StageTime { stage, seconds, kept }) = self.times.last() {
             let took = if *kept { "kept".to_owned() } else { format!("{seconds:.0} s") };
@@ -132,21 +132,21 @@ impl Work {
         }
     }
 
-    /// Returns the stage that began last and has not come; that which has failed, after an error.
+    /// Returns the stage that is running or, after an error, has failed.
     pub(super) fn running(&self) -> Option<Stage> {
         self.running
     }
 
-    /// Returns how long each stage took that has come.
+    /// Returns the durations of the completed stages.
     pub(super) fn times(&self) -> &[StageTime] {
         &self.times
     }
 
-    /// Returns the result of a stage: what is kept of it, if that was made from the same `inputs`; else what `run`
-    /// makes in the stage's folder, which is empty before.
+    /// Returns the result of a stage: the stored one if its `inputs` are unchanged, otherwise that of `run`, which gets
+    /// the empty folder of the stage.
     ///
     /// # Errors
-    /// Those of `run`; nothing is kept then.
+    /// Errors of `run`; in this case, nothing is stored.
     pub(super) fn stage<T: Serialize + DeserializeOwned>(
         &mut self,
         stage: Stage,
@@ -170,7 +170,7 @@ impl Work {
             return Ok(kept.result);
         }
         let files = self.folder(stage);
-        // What a stopped run has left is of no use.
+        // Files of an interrupted run cannot be used.
         for path in [&file, &files] {
             remove(path)?;
         }
@@ -190,7 +190,7 @@ impl Work {
     }
 }
 
-/// Returns what is kept under a key; what cannot be read is not kept.
+/// Returns the stored result with this key; `None` if there is none or it cannot be read.
 fn kept<T: DeserializeOwned>(file: &Path, key: &str) -> Option<Kept<T>> {
     let text = std::fs::read_to_string(file).ok()?;
     serde_json::from_str(&text).ok().filter(|kept: &Kept<T>| kept.key == key)
@@ -207,8 +207,8 @@ fn remove(path: &Path) -> Result<()> {
     }
 }
 
-/// What tells whether a file is the same as before: its length, when it was written, and its ends. A video is too long
-/// to be read whole each time.
+/// Fingerprint to detect changes of a file: length, modification time, and hash of both ends. A video is too large to
+/// hash completely each time.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct Fingerprint {
     path: PathBuf,
@@ -218,7 +218,7 @@ pub(super) struct Fingerprint {
 }
 
 impl Fingerprint {
-    /// Takes a file's.
+    /// Computes the fingerprint of a file.
     pub(super) fn of(path: &Path) -> Result<Self> {
         use std::io::{Read, Seek, SeekFrom};
         let read = || -> std::io::Result<Self> {
@@ -245,7 +245,7 @@ impl Fingerprint {
         read().with_context(|| format!("cannot read {}", path.display()))
     }
 
-    /// Takes those of all files below a folder, in the order of their names.
+    /// Computes the fingerprints of all files below a folder, in order of their names.
     pub(super) fn below(folder: &Path) -> Result<Vec<Self>> {
         let entries = std::fs::read_dir(folder)
             .with_context(|| format!("cannot read the folder {}", folder.display()))?;
@@ -265,16 +265,16 @@ impl Fingerprint {
     }
 }
 
-/// Of a file's begin and end.
+/// Size of each hashed end of a file.
 const END_BYTES: u64 = 1 << 20;
-/// More are no capture.
+/// Maximum number of files of a capture.
 const MAX_FILES: usize = 20_000;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Runs two stages; returns which of them ran.
+    /// Runs two stages. Returns the stages that were not reused.
     fn run(output: &Path, inputs: [u32; 2], from: Option<Stage>) -> Vec<Stage> {
         let mut work = Work::open(output, from).unwrap();
         let mut ran = Vec::new();
@@ -293,24 +293,24 @@ mod tests {
     }
 
     #[test]
-    fn what_has_not_changed_is_kept() {
+    fn reuses_stages_with_unchanged_inputs() {
         use Stage::{Images, Poses};
         let folder = tempfile::tempdir().unwrap();
         let output = folder.path().join("hall");
         assert_eq!(run(&output, [1, 1], None), [Images, Poses]);
         assert_eq!(run(&output, [1, 1], None), []);
         assert_eq!(run(&output, [1, 2], None), [Poses]);
-        // What comes after what changed is done again, though its own inputs are the same.
+        // Stages after a changed one run again, even if their own inputs are the same.
         assert_eq!(run(&output, [2, 2], None), [Images, Poses]);
         assert_eq!(run(&output, [2, 2], Some(Poses)), [Poses]);
         assert_eq!(run(&output, [2, 2], Some(Images)), [Images, Poses]);
-        // A damaged result is none.
+        // A damaged result is not used.
         std::fs::write(output.join("stages/images.json"), "{").unwrap();
         assert_eq!(run(&output, [2, 2], None), [Images]);
     }
 
     #[test]
-    fn a_stage_that_fails_is_not_kept() {
+    fn stores_nothing_of_a_failed_stage() {
         let folder = tempfile::tempdir().unwrap();
         let mut work = Work::open(folder.path(), None).unwrap();
         let failed: Result<u32> = work.stage(Stage::Images, &1, |_| anyhow::bail!("no"));
@@ -322,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_of_something_else_is_left_alone() {
+    fn rejects_a_folder_with_other_files() {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("thesis.tex"), "x").unwrap();
         let error = Work::open(folder.path(), None).unwrap_err().to_string();
@@ -330,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn a_changed_file_has_another_fingerprint() {
+    fn a_fingerprint_detects_changes_at_the_end_of_a_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("hall.mp4");
         let mut bytes = vec![7; 3 << 20];

@@ -1,4 +1,4 @@
-//! `vizflyt scene edit`: floaters out, walls cropped, the inside carved; as steps that can be taken back.
+//! `vizflyt scene edit`: crops, cleans and carves a scene, as a list of steps that can be undone.
 
 mod request;
 
@@ -20,13 +20,13 @@ use vizflyt_splat::edit::EditStep;
 use self::request::{CarveSettings, Requests};
 use crate::page::show_page;
 
-/// Crops, cleans, carves, thins out, turns and converts a scene; every step can be taken back.
+/// Crop, clean, carve, decimate, transform and convert a scene, with undo
 #[derive(Args, Debug)]
 #[command(
-    after_help = "The scene's file stays as it is. The steps go into a list beside it (room.ply.edits.toml), which names the
-original by its hash, and the result into a file of its own (room.edited.ply, or -o). Lengths and coordinates are in
-the file's own axes and units, as the steps before leave them. On the page a selection can also be named, as a part
-of the scene for `vizflyt dataset --parts` (room.ply.parts.toml).
+    after_help = "The scene file does not change. The steps are stored in a list next to it (room.ply.edits.toml), with the hash of the
+original. The result is a separate file (room.edited.ply, or -o). Lengths and coordinates are in the axes and units of
+the file after the previous steps. On the page, a selection can also get a name, as a part of the scene for
+`vizflyt dataset --parts` (room.ply.parts.toml).
 
 Examples:
   vizflyt scene edit room.ply --min-opacity 0.02 --drop-floaters --keep-parts
@@ -40,42 +40,44 @@ Examples:
 pub(crate) struct EditArgs {
     /// Scene file of any format, or an arena.toml (then its scene)
     scene: PathBuf,
-    /// Where the edited scene goes, in the format of its name [default: NAME.edited.* beside the original]
+    /// Edited scene file [default: NAME.edited.* next to the original]
+    ///
+    /// The name determines the format.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Prints the steps so far
+    /// Print the list of steps
     #[arg(long, conflicts_with_all = ["undo", "apply", "page", "output"])]
     list: bool,
-    /// Takes the last N steps back, the newest first
+    /// Undo the last N steps
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "1", conflicts_with_all = ["apply", "page"])]
     undo: Option<usize>,
-    /// Writes the edited scene again, from the original and the list
+    /// Write the edited scene again, from the original and the list of steps
     #[arg(long)]
     apply: bool,
-    /// Opens a page on which a lasso and a box select what goes, or what gets a name
+    /// Open a page to select splats with lasso and box, to delete or name them
     #[arg(long)]
     page: bool,
-    /// Where the page is served; port 0 takes a free one
+    /// Address of the page; port 0 selects a free one
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0", requires = "page")]
     http: SocketAddr,
-    /// What draws the page's pictures
+    /// Renderer of the page's images
     #[arg(long, value_enum, value_name = "KIND", default_value_t, requires = "page")]
     renderer: RendererKind,
-    /// Only prints the page's address
+    /// Only print the page's address
     #[arg(long, requires = "page")]
     no_browser: bool,
     #[command(flatten)]
     steps: Requests,
-    /// How wide --carve's free space must be around the path, and in gaps [default: 2 cells]
+    /// Minimum width of --carve's free space around the path [default: 2 cells]
     #[arg(long, value_name = "LENGTH", requires = "carve")]
     carve_radius: Option<f64>,
-    /// How much --carve leaves of a wall, behind its face [default: 3 cells]
+    /// Thickness of walls that --carve keeps behind their face [default: 3 cells]
     #[arg(long, value_name = "LENGTH", requires = "carve")]
     carve_depth: Option<f64>,
-    /// Side of --carve's cells [default: a 30th of the core's shortest side]
+    /// Edge length of --carve's cells [default: 1/30 of the core's shortest side]
     #[arg(long, value_name = "LENGTH", requires = "carve")]
     carve_cell: Option<f64>,
-    /// How far --carve looks [default: the core's longest side]
+    /// Maximum viewing distance of --carve [default: the core's longest side]
     #[arg(long, value_name = "LENGTH", requires = "carve")]
     carve_reach: Option<f64>,
 }
@@ -89,7 +91,7 @@ pub(crate) fn run(args: &EditArgs) -> Result<()> {
         return print_list(&original);
     }
     if args.undo.is_some() {
-        ensure!(!has_steps, "--undo takes steps back; give new ones in a command of their own");
+        ensure!(!has_steps, "--undo removes steps; give new ones in a separate command");
     }
     if !(has_steps || args.undo.is_some() || args.apply || args.page) {
         bail!(
@@ -117,7 +119,7 @@ pub(crate) fn run(args: &EditArgs) -> Result<()> {
         let said = step.to_string();
         let taken = editor.apply(step).with_context(|| said.clone())?;
         print_fmt!(
-            "step {:<6} {said}: {taken} splats away, {:.0} ms",
+            "step {:<6} {said}: {taken} splats removed, {:.0} ms",
             editor.steps().len(),
             elapsed_ms(start)
         );
@@ -131,12 +133,12 @@ pub(crate) fn run(args: &EditArgs) -> Result<()> {
     print_fmt!("written     {}: {left} splats, {:.0} ms", output.display(), elapsed_ms(start));
     let steps = editor.steps().len();
     print_fmt!(
-        "steps       {steps}, in {}; --undo takes the last one back",
+        "steps       {steps}, in {}; --undo removes the last one",
         list_path(&original).display()
     );
     if args.scene != original {
         print_fmt!(
-            "next        name {} as the scene's file in {}",
+            "next        set {} as the scene file in {}",
             output.display(),
             args.scene.display()
         );
@@ -155,13 +157,13 @@ fn print_list(original: &Path) -> Result<()> {
     };
     print_fmt!("scene       {}: {} splats", list.scene.file, list.scene.splats);
     for (index, done) in list.steps.iter().enumerate() {
-        print_fmt!("step {:<6} {}: {} splats away", index + 1, done.edit, done.taken);
+        print_fmt!("step {:<6} {}: {} splats removed", index + 1, done.edit, done.taken);
     }
     Ok(())
 }
 
 fn page(args: &EditArgs, editor: Editor, output: PathBuf) -> Result<()> {
-    // What has been turned here is upright now; what has been scaled is in metres.
+    // After a rotation step the scene is upright; after a scale step it is in metres.
     let has = |kind: fn(&EditStep) -> bool| editor.steps().iter().any(|done| kind(&done.edit));
     let bare = BareArgs {
         up: has(|step| matches!(step, EditStep::Turn { .. })).then_some(Up::Z),

@@ -1,4 +1,4 @@
-//! Steps as the command line asks for them: in its order, with what is left open found out of the scene.
+//! Steps of the command line, in their order. Parameters that are not given are derived from the scene.
 
 use std::str::FromStr;
 
@@ -9,22 +9,22 @@ use vizflyt_server::scene::{bounds, core};
 use vizflyt_splat::Splats;
 use vizflyt_splat::edit::{Axis, Carve, EditStep, Region};
 
-/// One step that is asked for.
+/// Requested step.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Request {
-    /// With all its parameters.
+    /// Step with all parameters.
     Step(EditStep),
-    /// Cell, and the least number of splats.
+    /// Cell, and minimum number of splats.
     Floaters(Option<f64>, u32),
-    /// Cell, and how many parts stay.
+    /// Cell, and number of parts to keep.
     Parts(Option<f64>, u32),
-    /// A path; the rest is [`CarveSettings`].
+    /// Path; the other parameters are in [`CarveSettings`].
     Carve(Vec<[f64; 3]>),
-    /// A share of the splats, 0 to 1.
+    /// Share of the splats, 0 to 1.
     Share(f64),
 }
 
-/// What a carve leaves open. [scene]
+/// Optional parameters of a carve. [scene]
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct CarveSettings {
     pub(super) radius: Option<f64>,
@@ -34,13 +34,13 @@ pub(super) struct CarveSettings {
 }
 
 impl Request {
-    /// Returns the step for a scene. What is not said comes from the size of its core.
+    /// Returns the step for a scene. Missing parameters are derived from the size of its core.
     pub(super) fn step(&self, splats: &Splats, carve: &CarveSettings) -> EditStep {
         let size = || {
             let [min, max] = bounds(core(splats, |p| p));
             max - min
         };
-        // A captured room is about 3 m high: cells of 5 cm.
+        // For a captured room of about 3 m height, this gives cells of 5 cm.
         let cell_of = |share: f64| rounded((size().min_element() / share).max(1e-6));
         let usual_cell = || cell_of(60.0);
         match self {
@@ -52,7 +52,7 @@ impl Request {
                 EditStep::Parts { cell: cell.unwrap_or_else(usual_cell), keep: *keep }
             }
             Self::Carve(path) => {
-                // Coarser: a room takes two million.
+                // Coarser cells, because a room needs two million of them.
                 let cell = carve.cell.unwrap_or_else(|| cell_of(30.0));
                 EditStep::Carve(Carve {
                     path: path.clone(),
@@ -69,84 +69,84 @@ impl Request {
     }
 }
 
-/// Returns a number to two digits: it is written down, and a guess is not better.
+/// Rounds a derived parameter to two digits, because it is stored in the list of steps.
 fn rounded(value: f64) -> f64 {
     format!("{value:.1e}").parse().unwrap_or(value)
 }
 
-/// The steps of a command line, in its order.
+/// Steps of a command line, in their order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Requests(pub(super) Vec<Request>);
 
-/// A flag: its name, how its value is written, its help, and what reads it.
+/// Option: name, value name, help, and parser.
 type Flag = (&'static str, &'static str, &'static str, fn(&str) -> Result<Request, String>);
 
 const FLAGS: [Flag; 17] = [
     (
         "crop-box",
         "MIN:MAX",
-        "Keeps what lies in a box along the scene's axes: X,Y,Z:X,Y,Z",
+        "Keep only a box along the scene's axes: X,Y,Z:X,Y,Z",
         |text| Ok(crop(boxed(text)?)),
     ),
-    ("crop-sphere", "CENTER:RADIUS", "Keeps what lies in a ball: X,Y,Z:R", |text| {
+    ("crop-sphere", "CENTER:RADIUS", "Keep only a sphere: X,Y,Z:R", |text| {
         Ok(crop(sphere(text)?))
     }),
     (
         "crop-prism",
         "AXIS:LOW,HIGH:P:P:P...",
-        "Keeps what lies within an outline, from LOW to HIGH along x, y or z; its points are the two other coordinates",
+        "Keep only a prism, LOW to HIGH along AXIS; points in the other two coordinates",
         |text| Ok(crop(prism(text)?)),
     ),
-    ("remove-box", "MIN:MAX", "Removes what lies in a box", |text| Ok(remove(boxed(text)?))),
-    ("remove-sphere", "CENTER:RADIUS", "Removes what lies in a ball", |text| {
+    ("remove-box", "MIN:MAX", "Remove a box", |text| Ok(remove(boxed(text)?))),
+    ("remove-sphere", "CENTER:RADIUS", "Remove a sphere", |text| {
         Ok(remove(sphere(text)?))
     }),
-    ("remove-prism", "AXIS:LOW,HIGH:P:P:P...", "Removes what lies within an outline", |text| {
+    ("remove-prism", "AXIS:LOW,HIGH:P:P:P...", "Remove a prism", |text| {
         Ok(remove(prism(text)?))
     }),
-    ("min-opacity", "OPACITY", "Removes what is fainter, 0 to 1", |text| {
+    ("min-opacity", "OPACITY", "Remove splats with a lower opacity, 0 to 1", |text| {
         Ok(Request::Step(EditStep::Faint { below: number(text)? }))
     }),
-    ("max-size", "SIZE", "Removes splats whose largest standard deviation is larger", |text| {
+    ("max-size", "SIZE", "Remove splats with a larger maximum standard deviation", |text| {
         Ok(Request::Step(EditStep::Large { above: number(text)? }))
     }),
-    ("min-size", "SIZE", "Removes splats whose largest standard deviation is smaller", |text| {
+    ("min-size", "SIZE", "Remove splats with a smaller maximum standard deviation", |text| {
         Ok(Request::Step(EditStep::Small { below: number(text)? }))
     }),
     (
         "drop-floaters",
         "CELL:LEAST",
-        "Removes connected parts of less than LEAST (50) splats, and haze in the open; CELL is about how near connects",
+        "Remove parts of less than LEAST (50) splats, and haze; CELL: linking distance",
         |text| cells(text, 50).map(|(cell, least)| Request::Floaters(cell, least)),
     ),
-    ("keep-parts", "CELL:COUNT", "Keeps the largest COUNT (1) connected parts", |text| {
+    ("keep-parts", "CELL:COUNT", "Keep only the largest COUNT (1) connected parts", |text| {
         cells(text, 1).map(|(cell, keep)| Request::Parts(cell, keep))
     }),
     (
         "carve",
         "P:P...",
-        "Keeps what is seen from the free space around a point, or around a path through points: X,Y,Z:X,Y,Z",
+        "Keep only what is visible from the free space around points: X,Y,Z:X,Y,Z",
         |text| text.split(':').map(point).collect::<Result<_, _>>().map(Request::Carve),
     ),
     (
         "decimate",
         "COUNT",
-        "Keeps so many splats, or so many per cent: the most opaque and largest",
+        "Keep only this number or percentage of splats: the most opaque and largest",
         share,
     ),
-    ("up", "AXIS", "Turns the scene so that this axis becomes +z: x, -x, y, -y, z or -z", |text| {
+    ("up", "AXIS", "Rotate the scene so that this axis becomes +z: x, -x, y, -y, z or -z", |text| {
         let up = Up::from_str(text).map_err(|error| error.to_string())?;
         Ok(Request::Step(EditStep::Turn { rotation: up.world_from_scene().to_array() }))
     }),
-    ("rotate", "X,Y,Z", "Turns it about x, then y, then z, counter-clockwise [deg]", |text| {
+    ("rotate", "X,Y,Z", "Rotate the scene about x, then y, then z, counter-clockwise [deg]", |text| {
         let rad = DVec3::from(point(text)?).map(f64::to_radians);
         let rotation = DQuat::from_euler(EulerRot::ZYX, rad.z, rad.y, rad.x).to_array();
         Ok(Request::Step(EditStep::Turn { rotation }))
     }),
-    ("scale", "FACTOR", "Makes it larger by this factor", |text| {
+    ("scale", "FACTOR", "Scale the scene by this factor", |text| {
         Ok(Request::Step(EditStep::Scale { factor: number(text)? }))
     }),
-    ("move", "X,Y,Z", "Moves it", |text| Ok(Request::Step(EditStep::Move { by: point(text)? }))),
+    ("move", "X,Y,Z", "Translate the scene", |text| Ok(Request::Step(EditStep::Move { by: point(text)? }))),
 ];
 
 impl clap::Args for Requests {
@@ -208,7 +208,7 @@ fn remove(region: Region) -> Request {
 }
 
 fn number(text: &str) -> Result<f64, String> {
-    text.trim().parse().map_err(|_| format!("'{text}' is no number"))
+    text.trim().parse().map_err(|_| format!("'{text}' is not a number"))
 }
 
 fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
@@ -224,7 +224,7 @@ pub(super) fn point(text: &str) -> Result<[f64; 3], String> {
 fn boxed(text: &str) -> Result<Region, String> {
     let (min, max) = text
         .split_once(':')
-        .ok_or("write the least corner, a colon, and the greatest: 0,0,0:4,3,2.5")?;
+        .ok_or("write the minimum corner, a colon, and the maximum corner: 0,0,0:4,3,2.5")?;
     Ok(Region::Box { min: point(min)?, max: point(max)? })
 }
 
@@ -248,14 +248,14 @@ fn prism(text: &str) -> Result<Region, String> {
     Ok(Region::Prism { axis, outline, low, high })
 }
 
-/// Parses a cell and a count, both of which may be left out.
+/// Parses a cell and a count, which are both optional.
 fn cells(text: &str, usual: u32) -> Result<(Option<f64>, u32), String> {
     let (cell, count) = text.split_once(':').unwrap_or((text, ""));
     let cell = if cell.is_empty() { None } else { Some(number(cell)?) };
     let wrong =
-        || format!("'{count}' is no count; write the cell's side, a colon, and the count: 0.2:50");
+        || format!("'{count}' is not a count; write the cell's side, a colon, and the count: 0.2:50");
     let count = if count.is_empty() { usual } else { count.parse().map_err(|_| wrong())? };
-    // Checked here, not after the scene was loaded.
+    // Checked here, because loading the scene takes long.
     let step = EditStep::Floaters { cell: cell.unwrap_or(1.0), least: count };
     step.check().map_err(|error| error.to_string())?;
     Ok((cell, count))
@@ -265,11 +265,11 @@ fn share(text: &str) -> Result<Request, String> {
     if let Some(percent) = text.strip_suffix('%') {
         let percent = number(percent)?;
         let is_meant = percent > 0.0 && percent <= 100.0;
-        let wrong = || format!("'{text}' is no share; give more than 0 % and up to 100 %");
+        let wrong = || format!("'{text}' is not a share; give more than 0 % and up to 100 %");
         return is_meant.then_some(Request::Share(percent / 100.0)).ok_or_else(wrong);
     }
     let count =
-        text.parse().map_err(|_| format!("'{text}' is no count; give splats, or per cent: 50%"))?;
+        text.parse().map_err(|_| format!("'{text}' is not a count; give splats, or per cent: 50%"))?;
     Ok(Request::Step(EditStep::Decimate { count }))
 }
 
@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_come_in_the_order_of_the_command_line() {
+    fn keeps_the_order_of_the_command_line() {
         let step = Request::Step;
         let line = "--scale 2 --drop-floaters --crop-box -1,0,0:1,2,3 --scale 0.5 --drop-floaters=0.2:9 --move -1,0,0";
         let within = vec![Region::Box { min: [-1.0, 0.0, 0.0], max: [1.0, 2.0, 3.0] }];
@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn every_flag_reads_an_example() {
+    fn parses_an_example_of_each_option() {
         for (flag, example) in [
             ("crop-sphere", "0,0,1:2.5"),
             ("remove-sphere", "0,0,1:2.5"),
@@ -327,7 +327,7 @@ mod tests {
             assert_eq!(read(&format!("--{flag} {example}")).unwrap().len(), 1, "{flag}");
         }
         assert_eq!(read("--keep-parts=:2").unwrap(), [Request::Parts(None, 2)]);
-        // About x first: y becomes z, and stays there about z.
+        // The rotation about x comes first: y becomes z, which the rotation about z keeps.
         let [Request::Step(EditStep::Turn { rotation })] = read("--rotate 90,0,90").unwrap()[..]
         else {
             panic!("a turn")
@@ -336,9 +336,9 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_meant_is_refused_with_advice() {
+    fn rejects_invalid_values_with_advice() {
         for (line, expected) in [
-            ("--crop-box 0,0,0", "the greatest"),
+            ("--crop-box 0,0,0", "the maximum corner"),
             ("--crop-box 0,0,0:0,1,1", "must exceed"),
             ("--crop-box 0,0:1,1,1", "not 3 numbers"),
             ("--crop-sphere 0,0,0:-1", "length above 0"),
@@ -346,10 +346,10 @@ mod tests {
             ("--crop-prism z:0,1:0,0:1,0", "3 to 2000 corners"),
             ("--min-opacity 5", "0 to 1"),
             ("--drop-floaters=0", "length above 0"),
-            ("--drop-floaters=0.1:x", "no count"),
+            ("--drop-floaters=0.1:x", "not a count"),
             ("--decimate 0%", "more than 0 %"),
             ("--decimate 0", "at least 1"),
-            ("--up w", "is no axis"),
+            ("--up w", "unknown axis"),
             ("--scale 0", "1e-6"),
             ("--carve 1,2", "not 3 numbers"),
         ] {

@@ -1,4 +1,5 @@
-//! The shoot: renders the walk, band by band, inks the tags, and has images developed and stored while the next are rendered.
+//! Rendering of a capture: renders the walk band by band and draws the tags. A second thread develops and stores the
+//! images.
 
 use std::sync::mpsc;
 use std::time::Instant;
@@ -20,18 +21,18 @@ use super::GenerateArgs;
 use super::sink::{Sink, Target};
 use super::truth::{CaptureTruth, ImageTruth};
 
-/// What is to be filmed, and where it goes.
+/// Settings and target of a capture.
 pub(super) struct Shoot {
     kind: vizflyt_scenes::SceneKind,
     seed: u64,
     target: Target,
     moving: bool,
     film: Film,
-    /// Middle of the middle row's exposure of every image. [s since the walk began]
+    /// Middle of the exposure of each image's middle row. [s since the start of the walk]
     instants_s: Vec<f64>,
 }
 
-/// An image that is rendered, and not yet developed.
+/// Rendered image that is not yet developed.
 struct Latent {
     number: usize,
     bands: Vec<BandImage>,
@@ -39,10 +40,10 @@ struct Latent {
 }
 
 impl Shoot {
-    /// Prepares what the command line asks for.
+    /// Returns the settings for a command line.
     ///
     /// # Errors
-    /// A size that no phone or no video has, or a number of images beyond the walk.
+    /// The image size is invalid, or the walk is too short for the number of images.
     pub(super) fn of(args: &GenerateArgs, target: Target) -> Result<Self> {
         let (width, height) = (args.size.width_px, args.size.height_px);
         let sides = SIDES_PX;
@@ -50,17 +51,17 @@ impl Shoot {
             bail!("--size {width}x{height}: give sides of {} to {} px", sides.start(), sides.end());
         }
         if matches!(target, Target::Video(_)) && (width % 2, height % 2) != (0, 0) {
-            bail!("--size {width}x{height}: a video has even sides");
+            bail!("--size {width}x{height}: a video needs even sides");
         }
         let instants_s = instants_s(&target, args.seconds, args.frames)?;
         let film = Film::new(Phone::draw(args.kind, args.seed, width, height));
         Ok(Self { kind: args.kind, seed: args.seed, target, moving: args.moving, film, instants_s })
     }
 
-    /// Films the walk.
+    /// Renders the walk and writes all files.
     ///
     /// # Errors
-    /// What cannot be rendered, encoded or written.
+    /// An image cannot be rendered, encoded or written.
     pub(super) fn run(self, set: &FilmSet) -> Result<()> {
         let phone = *self.film.phone();
         let layout = layout(&set.prints);
@@ -79,7 +80,7 @@ impl Shoot {
                 }
                 sink.finish()
             });
-            // Where the developer has failed, rendering stops, and its error is told.
+            // If the developer fails, rendering stops, and the developer's error is returned.
             let rendered = self.render(set, layout.as_ref(), &track, &latents);
             drop(latents);
             let developed = developer.join().expect("the developer does not panic");
@@ -103,7 +104,7 @@ impl Shoot {
         Ok(())
     }
 
-    /// Renders every image and hands it on; ends early where nobody takes them.
+    /// Renders each image and sends it to the developer. Stops early if the receiver is closed.
     fn render(
         &self,
         set: &FilmSet,
@@ -112,7 +113,7 @@ impl Shoot {
         latents: &mpsc::SyncSender<Latent>,
     ) -> Result<Vec<ImageTruth>> {
         let FilmSet { scene, .. } = set;
-        // The processor's renderer in full detail: the same images on every machine.
+        // CPU renderer in full detail, so that all machines produce the same images.
         let mut renderer =
             CpuRenderer::new(Scene { splats: &scene.splats, objects: &scene.objects });
         let movers = MovingObjects::new(&scene.arena, self.seed);
@@ -169,18 +170,18 @@ impl Shoot {
         self.seed
     }
 
-    /// Returns whether what moves did so.
+    /// Returns whether moving objects are animated.
     pub(super) fn moving(&self) -> bool {
         self.moving
     }
 
-    /// Returns images a second, of a video. [Hz]
+    /// Returns the frame rate of a video. [Hz]
     pub(super) fn rate_hz(&self) -> Option<f64> {
         matches!(self.target, Target::Video(_)).then_some(f64::from(RATE_HZ))
     }
 }
 
-/// Returns when images are taken.
+/// Returns the times of the images.
 fn instants_s(target: &Target, seconds: f64, frames: Option<u32>) -> Result<Vec<f64>> {
     if frames == Some(0) {
         bail!("--frames 0: give at least 1");
@@ -207,12 +208,12 @@ fn instants_s(target: &Target, seconds: f64, frames: Option<u32>) -> Result<Vec<
     }
 }
 
-/// Returns what is printed on the boards; `None` without boards.
+/// Returns the tags of the boards; `None` without boards.
 fn layout(prints: &[Print]) -> Option<TagLayout> {
     let tag = |(print, id): (&Print, u32)| {
         let pose = print.world_from_print;
         let world_from_tag: Pose<World, Square> = Pose::new(pose.translation_m, pose.rotation);
-        // Ten cells of eight of the black square, and a rim.
+        // The tag is ten cells wide, of which the black square has eight, plus a rim.
         let size_m = TAG_SHARE * print.side_m;
         Tag::new(TagFamily::Tag36h11, id, (size_m * 1e3).round() / 1e3, world_from_tag)
     };
@@ -220,7 +221,7 @@ fn layout(prints: &[Print]) -> Option<TagLayout> {
     (!tags.is_empty()).then_some(TagLayout { frame: LayoutFrame::World, tags })
 }
 
-/// Returns the phone's lens as `vizflyt tags calibrate` writes one.
+/// Returns the phone's lens in the format of `vizflyt tags calibrate`.
 fn camera_file(phone: &Phone) -> TagCamera {
     TagCamera {
         name: "phone".into(),
@@ -233,16 +234,16 @@ fn camera_file(phone: &Phone) -> TagCamera {
     }
 }
 
-/// Of a video, as phones film. [Hz]
+/// Frame rate of a video, as phones use it. [Hz]
 const RATE_HZ: u32 = 30;
-/// Of a folder, unless told.
+/// Default number of images in a folder.
 const FOLDER_IMAGES: u32 = 80;
-/// Exposures must not overlap. [Hz]
+/// Maximum image rate in a folder, because exposures must not overlap. [Hz]
 const MOST_HZ: f64 = 30.0;
-/// Blur of the ink, one standard deviation: with the pixel's box and the rows' interpolation some 0.6 px in all, as in a phone's
-/// video. [px]
+/// Standard deviation of the blur of drawn tags. With the pixel's area and the interpolation of rows, the total is
+/// about 0.6 px, as in a phone's video. [px]
 const OPTICS_PX: f64 = 0.3;
-/// Edge of a tag's black square, of the board's: 0.24 of 0.38 m.
+/// Edge of a tag's black square relative to the edge of its board: 0.24 m of 0.38 m.
 const TAG_SHARE: f64 = 0.24 / 0.38;
-/// Smaller images show no tag, larger ones take hours. [px]
+/// Allowed image sides: tags are not visible in smaller images, and larger ones take hours. [px]
 const SIDES_PX: std::ops::RangeInclusive<u32> = 64..=3840;

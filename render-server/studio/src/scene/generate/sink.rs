@@ -1,4 +1,5 @@
-//! Where a capture goes: a video that the program ffmpeg encodes from raw images on its standard input, or a folder of JPEG images.
+//! Output of a capture: a folder of JPEG images, or a video. The program ffmpeg encodes the video from raw images on
+//! its standard input.
 
 use std::fmt;
 use std::io::{ErrorKind, Read, Write};
@@ -8,26 +9,25 @@ use std::process::{Child, Command, Stdio};
 use anyhow::{Context, Result, anyhow, bail};
 use vizflyt_rgbd::encode_jpeg;
 
-/// Where a capture is to go.
+/// Target of a capture.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Target {
-    /// A video file.
     Video(PathBuf),
-    /// A folder of images.
+    /// Folder of images.
     Folder(PathBuf),
 }
 
 impl Target {
-    /// Returns what a path of the command line means: a video by its ending, else a folder.
+    /// Returns the target of a path: a video if it has a video's extension, otherwise a folder.
     ///
     /// # Errors
-    /// For the ending of another kind of file.
+    /// The path has the extension of another file type.
     pub(super) fn of(path: &Path) -> Result<Self> {
         let ending = path.extension().and_then(|ending| ending.to_str()).map(str::to_lowercase);
         match ending.as_deref() {
             _ if path.is_dir() => Ok(Self::Folder(path.to_owned())),
             Some("mp4" | "mkv" | "mov") => Ok(Self::Video(path.to_owned())),
-            // `images.v2/` is a folder by its slash.
+            // A path with a trailing slash is a folder, for example `images.v2/`.
             None => Ok(Self::Folder(path.to_owned())),
             _ if path.as_os_str().to_string_lossy().ends_with('/') => {
                 Ok(Self::Folder(path.to_owned()))
@@ -39,22 +39,22 @@ impl Target {
         }
     }
 
-    /// Returns where the truth goes.
+    /// Returns the path of the file with the true poses.
     pub(super) fn truth_file(&self) -> PathBuf {
         self.beside("truth.json")
     }
 
-    /// Returns where the lens goes.
+    /// Returns the path of the lens file.
     pub(super) fn camera_file(&self) -> PathBuf {
         self.beside("camera.toml")
     }
 
-    /// Returns where the tags' layout goes.
+    /// Returns the path of the layout of tags.
     pub(super) fn tags_file(&self) -> PathBuf {
         self.beside("tags.toml")
     }
 
-    /// Returns the name of an image's file; `None` in a video.
+    /// Returns the file name of an image; `None` for a video.
     pub(super) fn image_name(&self, number: usize) -> Option<String> {
         matches!(self, Self::Folder(_)).then(|| format!("{number:05}.jpg"))
     }
@@ -75,17 +75,17 @@ impl fmt::Display for Target {
     }
 }
 
-/// Takes images in order.
+/// Writer of images, in order.
 pub(super) struct Sink {
     target: Target,
     size_px: [u32; 2],
     video: Option<Encoding>,
 }
 
-/// A video on its way to the disk.
+/// Running ffmpeg process.
 struct Encoding {
     ffmpeg: Child,
-    /// Renamed when it is whole.
+    /// Temporary file, renamed when the video is complete.
     part: PathBuf,
 }
 
@@ -93,7 +93,7 @@ impl Sink {
     /// Opens the target.
     ///
     /// # Errors
-    /// If ffmpeg is not installed, or the folder cannot be made.
+    /// ffmpeg is not installed, or the folder cannot be created.
     pub(super) fn open(target: &Target, size_px: [u32; 2], rate_hz: u32) -> Result<Self> {
         let video = match target {
             Target::Video(file) => Some(Encoding::start(file, size_px, rate_hz)?),
@@ -106,16 +106,16 @@ impl Sink {
         Ok(Self { target: target.clone(), size_px, video })
     }
 
-    /// Takes an image, H x W x 3 bytes.
+    /// Writes an image of H x W x 3 bytes.
     ///
     /// # Errors
-    /// What ffmpeg says, or the disk.
+    /// ffmpeg fails, or a file cannot be written.
     pub(super) fn write(&mut self, number: usize, rgb: &[u8]) -> Result<()> {
         if let Some(video) = &mut self.video {
             let written = video.ffmpeg.stdin.as_mut().map(|pipe| pipe.write_all(rgb));
             return match written {
                 Some(Ok(())) => Ok(()),
-                // It has ended; it says why.
+                // ffmpeg has ended; the error contains its output.
                 _ => Err(video.failure()),
             };
         }
@@ -129,10 +129,10 @@ impl Sink {
         std::fs::write(&path, bytes).with_context(|| format!("cannot write {}", path.display()))
     }
 
-    /// Ends it.
+    /// Completes the output.
     ///
     /// # Errors
-    /// What ffmpeg says, or the disk.
+    /// ffmpeg fails, or a file cannot be written.
     pub(super) fn finish(mut self) -> Result<()> {
         let (Some(video), Target::Video(file)) = (&mut self.video, &self.target) else {
             return Ok(());
@@ -156,27 +156,27 @@ impl Encoding {
         command.args(["-nostdin", "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]);
         command.args(["-video_size", &format!("{width}x{height}")]);
         command.args(["-framerate", &rate_hz.to_string(), "-i", "-"]);
-        // H.264 with every fourth colour, as phones encode; a hall of 640x480 takes 1 Mbit/s.
+        // H.264 with 4:2:0 colour, as phones use it; a video of a hall at 640x480 has 1 Mbit/s.
         command
             .args(["-c:v", "libx264", "-preset", "veryfast", "-crf", "19", "-pix_fmt", "yuv420p"]);
         command.arg(&part);
         command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
         let ffmpeg = command.spawn().map_err(|error| match error.kind() {
             ErrorKind::NotFound => anyhow!(
-                "a video is encoded by the program ffmpeg, which is not installed; `apt-get install ffmpeg` brings \
-                 it, or give --capture a folder for images"
+                "a video is encoded by the program ffmpeg, which is not installed; run `apt-get install ffmpeg`, \
+                 or give --capture a folder for images"
             ),
             _ => anyhow!("cannot start ffmpeg: {error}"),
         })?;
         Ok(Self { ffmpeg, part })
     }
 
-    /// Returns why ffmpeg has ended.
+    /// Returns the error output of ffmpeg.
     fn failure(&mut self) -> anyhow::Error {
         drop(self.ffmpeg.stdin.take());
         let mut said = String::new();
         if let Some(mut stderr) = self.ffmpeg.stderr.take() {
-            // What can be read is told.
+            // A read error must not hide the output that was read.
             let _ = stderr.read_to_string(&mut said);
         }
         anyhow!("ffmpeg cannot encode {}: {}", self.part.display(), said.trim())
@@ -185,14 +185,14 @@ impl Encoding {
 
 impl Drop for Encoding {
     fn drop(&mut self) {
-        // Without effect on one that has ended well.
+        // These have no effect after a successful end.
         let _ = self.ffmpeg.kill();
         let _ = self.ffmpeg.wait();
         let _ = std::fs::remove_file(&self.part);
     }
 }
 
-/// A phone's; blocks are hardly seen.
+/// Quality as of phones; block artefacts are hardly visible.
 const JPEG_QUALITY: u8 = 95;
 
 #[cfg(test)]
@@ -200,7 +200,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_path_is_a_video_or_a_folder() {
+    fn distinguishes_videos_from_folders() {
         let of = |path: &str| Target::of(Path::new(path)).map_err(|error| error.to_string());
         assert_eq!(of("a/hall.mp4"), Ok(Target::Video("a/hall.mp4".into())));
         assert_eq!(of("hall.MOV"), Ok(Target::Video("hall.MOV".into())));

@@ -1,4 +1,4 @@
-//! `truth.json`: where the camera of a capture truly was, and how each image was exposed (`docs/guides/capture.md`).
+//! `truth.json`: true camera poses and exposures of a generated capture (`docs/guides/capture.md`).
 
 use std::path::Path;
 
@@ -11,32 +11,32 @@ use vizflyt_tags::layout::{Tag, TagLayout};
 
 use super::film::Shoot;
 
-/// The whole file.
+/// Content of `truth.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CaptureTruth {
-    /// 1; another where a field changes its meaning.
+    /// Format version: 1. It changes if a field changes its meaning.
     pub version: u32,
     pub scene: SceneTruth,
     pub camera: CameraTruth,
-    /// In order; of a video, one a picture.
+    /// Images in order; of a video, all of them.
     pub images: Vec<ImageTruth>,
-    /// As `tags.toml` has them. [m, world]
+    /// Tags, as in `tags.toml`. [m, world]
     pub tags: Vec<Tag>,
 }
 
-/// What was filmed.
+/// Captured scene.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct SceneTruth {
-    /// As `vizflyt scene generate` takes it.
+    /// Kind, as in `vizflyt scene generate KIND`.
     pub kind: String,
     pub seed: u64,
-    /// Whether what moves in the scene did so, or stood still.
+    /// Whether moving objects were animated.
     pub moving: bool,
 }
 
-/// The camera. Pixels are continuous: (0, 0) is the image's corner, the first pixel's middle (0.5, 0.5).
+/// Camera. Pixel coordinates are continuous: (0, 0) is the image's corner, (0.5, 0.5) the centre of the first pixel.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CameraTruth {
@@ -46,37 +46,37 @@ pub(crate) struct CameraTruth {
     pub fy_px: f64,
     pub cx_px: f64,
     pub cy_px: f64,
-    /// As OpenCV defines it.
+    /// Distortion as defined by OpenCV.
     pub distortion: Option<LensConfig>,
-    /// From the upper edge's exposure to the lower edge's; evenly in between. [s]
+    /// Time from the exposure of the upper edge to that of the lower edge, linear in between. [s]
     pub readout_s: f64,
-    /// Images a second of a video; null of a folder. [Hz]
+    /// Frame rate of a video; null for a folder. [Hz]
     pub rate_hz: Option<f64>,
 }
 
-/// One image.
+/// True pose and exposure of an image.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ImageTruth {
-    /// In a folder; null in a video.
+    /// File name in a folder; null in a video.
     pub file: Option<String>,
-    /// Middle of the exposure of the image's middle. [ns since the walk began]
+    /// Middle of the exposure of the image's middle row. [ns since the start of the walk]
     pub stamp_ns: u64,
-    /// Then. [m, world]
+    /// Pose at `stamp_ns`. [m, world]
     pub world_from_cam: PoseConfig,
-    /// In the middle of the exposure of its upper edge. [m, world]
+    /// Pose in the middle of the exposure of the upper edge. [m, world]
     pub upper_edge: PoseConfig,
-    /// And of its lower edge. [m, world]
+    /// Pose in the middle of the exposure of the lower edge. [m, world]
     pub lower_edge: PoseConfig,
-    /// What the scene's linear light was multiplied by.
+    /// Factor applied to the scene's linear light.
     pub gain: f64,
-    /// How long each row was exposed. [s]
+    /// Exposure time of each row. [s]
     pub shutter_s: f64,
     pub iso: f64,
 }
 
 impl CaptureTruth {
-    /// Puts it together.
+    /// Returns the content of the file.
     pub(super) fn new(
         shoot: &Shoot,
         phone: &Phone,
@@ -107,7 +107,7 @@ impl CaptureTruth {
         }
     }
 
-    /// Writes the file.
+    /// Writes the file as JSON.
     pub(super) fn write(&self, path: &Path) -> Result<()> {
         let text = serde_json::to_string_pretty(self)?;
         std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
@@ -115,7 +115,7 @@ impl CaptureTruth {
 }
 
 impl ImageTruth {
-    /// States an image whose middle is exposed at `middle_s`.
+    /// Returns the entry of an image with its middle row exposed at `middle_s`.
     pub(super) fn new(
         film: &Film,
         track: &Track<'_>,
@@ -143,11 +143,11 @@ impl ImageTruth {
 mod tests {
     use super::*;
 
-    /// The file as `docs/guides/capture.md` has it; a field that is added, renamed or dropped changes this.
+    /// Example of `docs/guides/capture.md`. It must change if a field is added, renamed or removed.
     const EXAMPLE: &str = include_str!("truth.example.json");
 
     #[test]
-    fn the_documented_file_is_the_file() {
+    fn the_documented_example_is_valid_and_complete() {
         let truth: CaptureTruth = serde_json::from_str(EXAMPLE).unwrap();
         assert_eq!(truth.version, 1);
         let back = serde_json::to_value(&truth).unwrap();
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_that_is_absent_or_unknown_is_an_error() {
+    fn rejects_missing_and_unknown_fields() {
         let read =
             |text: &str| serde_json::from_str::<CaptureTruth>(text).map_err(|e| e.to_string());
         for (from, to, part) in [

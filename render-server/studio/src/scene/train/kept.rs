@@ -1,4 +1,4 @@
-//! A training under way, kept beside the scene that it will write: `my-hall.ply.training`, until it is done.
+//! Checkpoints of a training, next to its output file: `my-hall.ply.training`. They are removed at the end.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -7,10 +7,10 @@ use anyhow::{Context, Result, bail};
 use vizflyt_twin::Trainer;
 use vizflyt_twin::train::Checkpoint;
 
-/// What is lost of an interrupted training at most.
+/// Interval between checkpoints: the maximum loss of an interrupted training.
 const EVERY: Duration = Duration::from_mins(1);
 
-/// Writes a training from time to time.
+/// Writer of the checkpoints.
 #[derive(Debug)]
 pub(super) struct Kept {
     path: PathBuf,
@@ -18,53 +18,54 @@ pub(super) struct Kept {
 }
 
 impl Kept {
-    /// Begins for a scene that will be written.
+    /// Returns the writer for an output file.
     pub(super) fn beside(output: &Path) -> Self {
         let mut path = output.as_os_str().to_owned();
         path.push(".training");
         Self { path: path.into(), next: Instant::now() + EVERY }
     }
 
-    /// Returns what was kept, if it is to be gone on with.
+    /// Returns the checkpoint to resume from, if `resume`.
     ///
     /// # Errors
-    /// What there is, and is not asked for; or what is asked for, and not there or damaged.
+    /// A checkpoint exists, but neither `resume` nor `force` is set. Or `resume` is set, but the checkpoint is missing
+    /// or damaged.
     pub(super) fn find(&self, resume: bool, force: bool) -> Result<Option<Checkpoint>> {
         let path = self.path.display();
         if !resume {
             if self.path.exists() && !force {
                 bail!(
-                    "{path} is an interrupted training; --resume goes on with it, --force begins anew"
+                    "{path} is an interrupted training; give --resume to continue it, or --force to restart"
                 );
             }
             return Ok(None);
         }
         if !self.path.exists() {
-            bail!("{path} is not there: nothing was interrupted; leave out --resume to begin");
+            bail!("{path} does not exist: there is no interrupted training; omit --resume to start one");
         }
         let bytes = std::fs::read(&self.path).with_context(|| format!("cannot read {path}"))?;
         Ok(Some(Checkpoint::from_bytes(&bytes).with_context(|| path.to_string())?))
     }
 
-    /// Writes the training if it is time; one that cannot be written goes on and says so.
+    /// Writes a checkpoint if the interval has passed. If that fails, it logs a warning and the training continues.
     pub(super) fn keep(&mut self, trainer: &Trainer<'_>) {
         if Instant::now() < self.next {
             return;
         }
         if let Err(error) = self.write(trainer) {
-            tracing::warn!("{error:#}; training goes on, and cannot be resumed from here");
+            tracing::warn!("{error:#}; the training continues, but cannot be resumed from here");
         }
         self.next = Instant::now() + EVERY;
     }
 
-    /// Removes what was kept: the training is done.
+    /// Removes the checkpoint at the end of the training.
     pub(super) fn remove(&self) {
-        // It may never have been written.
+        // The file may not exist.
         let _ = std::fs::remove_file(&self.path);
     }
 
     fn write(&self, trainer: &Trainer<'_>) -> Result<()> {
-        // Whole or not at all: the last one stays until this one is written.
+        // Atomic: the previous checkpoint stays until the new one is complete.
         let mut new = self.path.clone().into_os_string();
         new.push(".new");
         std::fs::write(&new, trainer.checkpoint().to_bytes())
@@ -78,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_there_and_what_is_asked_for_must_agree() {
+    fn resume_and_force_must_match_the_existing_files() {
         let folder = tempfile::tempdir().expect("a folder");
         let kept = Kept::beside(&folder.path().join("hall.ply"));
         let says = |resume: bool, force: bool| match kept.find(resume, force) {
@@ -86,7 +87,7 @@ mod tests {
             Err(error) => format!("{error:#}"),
         };
         assert_eq!(says(false, false), "false");
-        assert!(says(true, false).contains("nothing was interrupted"));
+        assert!(says(true, false).contains("there is no interrupted training"));
         std::fs::write(&kept.path, b"no training").expect("written");
         assert!(says(false, false).contains("--resume"), "{}", says(false, false));
         assert_eq!(says(false, true), "false");

@@ -1,14 +1,14 @@
-//! How blurred an image is, whatever it shows.
+//! Blur metric of an image, independent of its content.
 //!
 //! F. Crete, T. Dolmiere, P. Ladret, M. Nicolas, "The blur effect: perception and estimation with a new no-reference
-//! perceptual blur metric", SPIE 6492, 2007: what is sharp loses much of its differences between neighbours when it is
-//! blurred again, what is blurred already loses little.
+//! perceptual blur metric", SPIE 6492, 2007: a second blur removes much of the differences between neighbouring pixels
+//! of a sharp image, but little of those of an image that is already blurred.
 
-/// Returns how blurred an image of H x W grey levels is, the mean of across and down, from 0 (sharp) to 1; 1 of an image
-/// of one grey. The paper takes the greater of both, which hides a drag across what is less sharp down by itself.
+/// Returns the blur of an image of H x W grey levels, from 0 (sharp) to 1: the mean of both directions. A uniform image
+/// has 1. The paper uses the maximum of both, which hides horizontal motion blur if the vertical one is larger anyway.
 pub(super) fn blur(width: usize, height: usize, grey: &[u8]) -> f64 {
     assert_eq!(grey.len(), width * height, "an image of another size");
-    // Noise differs from pixel to pixel, as no edge does: the mean over squares keeps edges, and less of it.
+    // The mean over squares reduces noise, which differs from pixel to pixel, but keeps edges.
     let by = (width / FINE_PX).max(2);
     let (small_width, small_height) = (width / by, height / by);
     if small_width < 2 * REACH || small_height < 2 * REACH {
@@ -30,7 +30,7 @@ pub(super) fn blur(width: usize, height: usize, grey: &[u8]) -> f64 {
     f64::midpoint(across, down)
 }
 
-/// Returns the blur along the first coordinate, of `length` values in each of `lines`.
+/// Returns the blur along the first coordinate, of `lines` lines with `length` values each.
 fn along(length: usize, lines: usize, at: impl Fn(usize, usize) -> f32) -> f64 {
     let (mut sharp, mut lost) = (0.0, 0.0);
     let mut line = vec![0.0; length];
@@ -38,7 +38,7 @@ fn along(length: usize, lines: usize, at: impl Fn(usize, usize) -> f32) -> f64 {
         for (x, value) in line.iter_mut().enumerate() {
             *value = at(x, number);
         }
-        // The mean over the window changes by what comes in less what goes out.
+        // Difference of two adjacent box means: value that enters minus value that leaves.
         let pairs = line.windows(2 * REACH + 2).map(|window| {
             let difference = (window[REACH + 1] - window[REACH]).abs();
             let blurred = (window[2 * REACH + 1] - window[0]).abs() / (2 * REACH + 1) as f32;
@@ -52,9 +52,9 @@ fn along(length: usize, lines: usize, at: impl Fn(usize, usize) -> f32) -> f64 {
     if sharp > 0.0 { (sharp - lost) / sharp } else { 1.0 }
 }
 
-/// Of the mean over nine pixels that is laid over the image.
+/// Radius of the box filter of nine pixels.
 const REACH: usize = 4;
-/// Images are looked at about so wide. [px]
+/// Approximate width to which images are reduced. [px]
 const FINE_PX: usize = 480;
 
 #[cfg(test)]
@@ -63,7 +63,7 @@ mod tests {
 
     const SIZE: (usize, usize) = (320, 240);
 
-    /// Squares of several sizes and greys with noise, dragged along by so many pixels.
+    /// Returns squares of several sizes and greys with noise, with motion blur of this number of pixels.
     fn dragged(across: usize, down: usize) -> Vec<u8> {
         let (width, height) = SIZE;
         let grey = |x: usize, y: usize| -> f64 {
@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn more_drag_is_more_blur_whichever_way() {
+    fn blur_increases_with_motion_in_each_direction() {
         let of = |across, down| blur(SIZE.0, SIZE.1, &dragged(across, down));
         for turn in [|n: usize| (n, 0), |n: usize| (0, n), |n: usize| (n, n)] {
             let blurs: Vec<f64> = [0, 4, 8, 16].map(|n| of(turn(n).0, turn(n).1)).to_vec();
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_to_see_is_not_sharp() {
+    fn uniform_and_tiny_images_are_not_sharp() {
         assert_eq!(blur(64, 48, &[9; 64 * 48]), 1.0);
         assert_eq!(blur(3, 2, &[0, 255, 0, 255, 0, 255]), 1.0);
     }

@@ -1,8 +1,8 @@
-//! Which pictures of a video are taken, and what is to be said of them.
+//! Selection of pictures from a video, and remarks about their quality.
 
 use super::{Choice, FRAMES, Pictures, clock};
 
-/// Parts of a video's time, of each of which the sharpest picture is taken.
+/// Time intervals of a video. The sharpest picture of each is selected.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Buckets {
     count: usize,
@@ -16,8 +16,8 @@ impl Buckets {
         Self { count, bucket_s: duration_s.max(1e-3) / count as f64 }
     }
 
-    /// Returns which part a time lies in; `None` near its ends, so that no two pictures come from one instant, and
-    /// none are two parts apart. Of a video with few pictures a second, all are looked at.
+    /// Returns the index of the interval of a time. `None` near the ends of an interval, so that selected pictures are
+    /// neither too close together nor two intervals apart. For a low frame rate, all pictures are considered.
     pub(super) fn find(&self, at_s: f64, rate_hz: f64) -> Option<usize> {
         let place = at_s / self.bucket_s;
         let bucket = (place.max(0.0) as usize).min(self.count - 1);
@@ -26,7 +26,7 @@ impl Buckets {
     }
 }
 
-/// Returns what a person should know of the pictures.
+/// Returns remarks about blur and brightness, for the user.
 pub(super) fn remarks(of: &Pictures) -> Vec<String> {
     let pictures = &of.pictures;
     let mut remarks = Vec::new();
@@ -62,7 +62,7 @@ pub(super) fn remarks(of: &Pictures) -> Vec<String> {
     remarks
 }
 
-/// Returns runs of numbers as places: "0:07 to 0:09, 0:31".
+/// Returns runs of numbers as text: "0:07 to 0:09, 0:31".
 fn spans(numbers: &[usize], place: impl Fn(usize) -> String) -> String {
     let mut runs: Vec<[usize; 2]> = Vec::new();
     for &number in numbers {
@@ -86,19 +86,19 @@ fn spans(numbers: &[usize], place: impl Fn(usize) -> String) -> String {
     text
 }
 
-/// Pictures of a video, without being told. At two a second, in the turns of the generated hall's walk (60 degrees a second),
-/// the chain from picture to picture broke in four places; at three, in none.
+/// Default rate of pictures of a video. In the turns of the generated hall's walk (60 degrees per second), the chain of
+/// pictures broke at four places with 2 Hz, and at none with 3 Hz. [Hz]
 const PER_SECOND: f64 = 3.0;
-/// Share of a part that is looked at.
+/// Share of an interval from which pictures are selected.
 const MIDDLE: f64 = 2.0 / 3.0;
-/// Pictures to a part: of fewer, its middle may hold none.
+/// Minimum number of pictures per interval for this restriction: with fewer, the middle may contain none.
 const SPARSE: f64 = 3.0;
-/// So much more than usual is more blur than texture tells: 8 px of drag at 320 px of width add 0.09 to 0.16
+/// Excess over the median blur that texture cannot explain: motion blur of 8 px at a width of 320 px adds 0.09 to 0.16
 /// (`blur::tests`).
 const BLURRED: f64 = 0.1;
-/// More light from one picture to the next than people walk through.
+/// Maximum brightness ratio of consecutive pictures on a normal walk.
 const JUMP: f64 = 1.6;
-/// Longer lists are not read.
+/// Maximum number of listed runs.
 const MOST_SPANS: usize = 6;
 
 #[cfg(test)]
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn every_part_of_the_time_has_its_picture() {
+    fn assigns_times_to_intervals() {
         assert_eq!(Buckets::new(50.0, choice(None)).count, 150);
         assert_eq!(Buckets::new(5.0, choice(None)).count, 80);
         assert_eq!(Buckets::new(900.0, choice(None)).count, 300);
@@ -124,19 +124,19 @@ mod tests {
             (2.1, None),
             (3.0, Some(1)),
             (9.5, Some(4)),
-            // Longer than it said it was.
+            // Beyond the duration in the file.
             (10.9, None),
             (-1.0, None),
         ] {
             assert_eq!(buckets.find(at_s, 30.0), bucket, "at {at_s} s");
         }
-        // Three pictures a second lie between the middles of their parts.
+        // At 3 Hz, each picture belongs to its own interval.
         let sparse = Buckets::new(50.0, choice(None));
         assert!((0..150).all(|n| sparse.find(f64::from(n) / 3.0 + 1e-9, 3.0) == Some(n as usize)));
     }
 
     #[test]
-    fn blur_and_jumps_are_told_by_their_time() {
+    fn remarks_name_the_times_of_blur_and_brightness_jumps() {
         let picture = |number: usize| Picture {
             name: format!("{number}.jpg"),
             at_s: number as f64 * 2.0,

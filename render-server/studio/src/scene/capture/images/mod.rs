@@ -1,4 +1,4 @@
-//! The first stage: sharp pictures of a video, evenly over its time, or a folder of photos as it is.
+//! First stage: selects sharp pictures of a video, evenly over its time, or reads a folder of photos.
 
 mod blur;
 mod choose;
@@ -11,20 +11,19 @@ use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 pub(super) use video::probe;
 
-/// What was filmed.
+/// Input of a capture.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Source {
-    /// A video file.
     Video(PathBuf),
-    /// A folder with photos.
+    /// Folder with photos.
     Folder(PathBuf),
 }
 
 impl Source {
-    /// Returns what a path of the command line is.
+    /// Returns the type of input at a path.
     ///
     /// # Errors
-    /// Nothing there, or a folder without photos.
+    /// The path does not exist, or the folder has no photos.
     pub(super) fn of(path: &Path) -> Result<Self> {
         if path.is_dir() {
             return photos::folder(path).map(Self::Folder);
@@ -39,58 +38,58 @@ impl Source {
     }
 }
 
-/// Pictures to find poses of.
+/// Pictures of a capture.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Pictures {
-    /// Where they lie.
+    /// Folder of the pictures.
     pub(super) folder: PathBuf,
-    /// Of each. [px]
+    /// Size of each picture. [px]
     pub(super) size_px: [u32; 2],
-    /// Whether they are of one video: then times are its own.
+    /// Whether they are from a video, so that their times are known.
     pub(super) of_video: bool,
-    /// In the order of time.
+    /// Pictures in order of time.
     pub(super) pictures: Vec<Picture>,
 }
 
-/// One picture.
+/// Entry of a picture.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Picture {
-    /// Below the folder.
+    /// Path relative to the folder.
     pub(super) name: String,
-    /// From the start of the video; of photos their number. [s]
+    /// Time since the start of the video [s]; for photos, the index.
     pub(super) at_s: f64,
-    /// From 0, sharp, to 1.
+    /// Blur, from 0 (sharp) to 1.
     pub(super) blur: f64,
-    /// Mean of its grey levels, of 255.
+    /// Mean grey level, 0 to 255.
     pub(super) grey: f64,
 }
 
 impl Pictures {
-    /// Returns when a picture was taken, by its name.
+    /// Returns the time of the picture with this name; infinity if there is none.
     pub(super) fn at_s(&self, name: &str) -> f64 {
         let found = self.pictures.iter().find(|picture| picture.name == name);
         found.map_or(f64::INFINITY, |picture| picture.at_s)
     }
 
-    /// Returns what a person should know of them, in words.
+    /// Returns remarks about the pictures for the user.
     pub(super) fn remarks(&self) -> Vec<String> {
         choose::remarks(self)
     }
 }
 
-/// What to take of a video.
+/// Settings for the selection of pictures from a video.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(super) struct Choice {
-    /// So many pictures; `None`: three a second, within [`FRAMES`].
+    /// Number of pictures; `None`: three per second, within [`FRAMES`].
     pub(super) frames: Option<usize>,
-    /// Wider ones are made smaller. [px]
+    /// Maximum width; wider pictures are downscaled. [px]
     pub(super) width_px: u32,
 }
 
-/// Takes the pictures of a source; those of a video are written into `folder`.
+/// Reads the pictures of a source. Pictures of a video are written into `folder`.
 ///
 /// # Errors
-/// What cannot be read, in words.
+/// The source cannot be read.
 pub(super) fn take(source: &Source, choice: Choice, folder: &Path) -> Result<Pictures> {
     match source {
         Source::Video(file) => video::take(file, choice, folder),
@@ -98,11 +97,12 @@ pub(super) fn take(source: &Source, choice: Choice, folder: &Path) -> Result<Pic
     }
 }
 
-/// Returns the time of a video as people write it, "0:07".
+/// Returns the time in a video as text: "0:07".
 pub(super) fn clock(at_s: f64) -> String {
     let whole_s = at_s.max(0.0) as u64;
     format!("{}:{:02}", whole_s / 60, whole_s % 60)
 }
 
-/// Fewer do not overlap on a walk, more take long: 150 pictures of 640x480 take two minutes on two cores.
+/// Default range of the number of pictures. Fewer do not overlap enough, and more take long: 150 pictures of 640x480
+/// take two minutes on two cores.
 const FRAMES: std::ops::RangeInclusive<usize> = 80..=300;

@@ -1,4 +1,4 @@
-//! Photos that lie in a folder: they stay there.
+//! Photos in a folder. They are not copied.
 
 use std::path::{Path, PathBuf};
 
@@ -9,10 +9,10 @@ use super::blur::blur;
 use super::{Picture, Pictures};
 use crate::scene::progress::Progress;
 
-/// Returns the folder itself, or its `images`, whichever has photos.
+/// Returns the folder with photos: the given one or its subfolder `images`.
 ///
 /// # Errors
-/// Neither has.
+/// Neither contains photos.
 pub(super) fn folder(path: &Path) -> Result<PathBuf> {
     for candidate in [path.to_owned(), path.join("images")] {
         if candidate.is_dir() && !list(&candidate)?.is_empty() {
@@ -20,7 +20,7 @@ pub(super) fn folder(path: &Path) -> Result<PathBuf> {
         }
     }
     bail!(
-        "{} holds no photos (.jpg, .jpeg, .png); convert others first, as HEIC of a phone: \
+        "{} holds no photos (.jpg, .jpeg, .png); convert other formats first, for example HEIC of a phone: \
          ffmpeg -i photo.heic photo.jpg",
         path.display()
     );
@@ -42,7 +42,7 @@ fn list(folder: &Path) -> Result<Vec<String>> {
     Ok(names)
 }
 
-/// Looks at the photos of a folder.
+/// Reads size, blur and brightness of the photos of a folder.
 pub(super) fn take(folder: &Path) -> Result<Pictures> {
     let names = list(folder)?;
     let mut progress = Progress::new("");
@@ -62,7 +62,7 @@ pub(super) fn take(folder: &Path) -> Result<Pictures> {
         let first = *size_px.get_or_insert(size);
         ensure!(
             size == first,
-            "{} has {} x {} pixels, {} has {} x {}: photos of one camera, held one way, are needed",
+            "{} has {} x {} pixels, {} has {} x {}: use photos of one camera in one orientation",
             path.display(),
             size[0],
             size[1],
@@ -82,7 +82,7 @@ pub(super) fn take(folder: &Path) -> Result<Pictures> {
     Ok(Pictures { folder: folder.to_owned(), size_px, of_video: false, pictures })
 }
 
-/// Returns the mean of grey levels.
+/// Returns the mean grey level.
 pub(super) fn mean(grey: &[u8]) -> f64 {
     grey.iter().map(|&value| u64::from(value)).sum::<u64>() as f64 / grey.len().max(1) as f64
 }

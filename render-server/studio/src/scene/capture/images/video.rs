@@ -1,4 +1,4 @@
-//! A video through the programs ffmpeg and ffprobe: every picture is looked at, the sharpest of each time is kept.
+//! Reads a video with the programs ffmpeg and ffprobe, and stores the sharpest picture of each time interval.
 
 use std::io::{ErrorKind, Read};
 use std::path::Path;
@@ -14,14 +14,14 @@ use super::photos::mean;
 use super::{Choice, Picture, Pictures};
 use crate::scene::progress::Progress;
 
-/// The best picture of a part of the time so far.
+/// Sharpest picture of the current interval.
 struct Best {
     at_s: f64,
     blur: f64,
     image: Colours,
 }
 
-/// Takes the sharpest picture of each part of a video's time, and writes it into `folder`.
+/// Writes the sharpest picture of each time interval of a video into `folder`.
 pub(super) fn take(file: &Path, choice: Choice, folder: &Path) -> Result<Pictures> {
     let duration_s = probe(file)?;
     let buckets = Buckets::new(duration_s, choice);
@@ -83,17 +83,17 @@ fn write(best: &Best, number: usize, folder: &Path) -> Result<Picture> {
     Ok(Picture { name, at_s: *at_s, blur: *blur, grey: mean(luma) })
 }
 
-/// Returns the colour of full-range YCbCr (ITU-T T.871, 7).
+/// Converts full-range YCbCr to RGB (ITU-T T.871, 7).
 fn rgb([y, cb, cr]: [u8; 3]) -> [u8; 3] {
     let [y, cb, cr] = [f32::from(y), f32::from(cb) - 128.0, f32::from(cr) - 128.0];
     [y + 1.402 * cr, y - 0.344136 * cb - 0.714136 * cr, y + 1.772 * cb]
         .map(|value| (value + 0.5) as u8)
 }
 
-/// Returns how long a video is. [s]
+/// Returns the duration of a video. [s]
 ///
 /// # Errors
-/// No video, or no ffprobe.
+/// The file is not a video, or ffprobe is not installed.
 pub(in super::super) fn probe(file: &Path) -> Result<f64> {
     let mut command = Command::new("ffprobe");
     command.args(["-v", "error", "-select_streams", "v:0"]);
@@ -102,13 +102,13 @@ pub(in super::super) fn probe(file: &Path) -> Result<f64> {
         command.stdin(Stdio::null()).output().map_err(|error| absent("ffprobe", &error))?;
     if !output.status.success() {
         let said = String::from_utf8_lossy(&output.stderr);
-        bail!("{} is no video that ffmpeg reads: {}", file.display(), said.trim());
+        bail!("ffmpeg cannot read {} as a video: {}", file.display(), said.trim());
     }
     duration_s(&output.stdout)
-        .with_context(|| format!("{}: ffprobe finds no video with a length in it", file.display()))
+        .with_context(|| format!("{}: ffprobe finds no video with a duration", file.display()))
 }
 
-/// Returns the length that ffprobe prints: the picture's own, else the file's. [s]
+/// Returns the duration from ffprobe's output: that of the video stream, otherwise that of the file. [s]
 fn duration_s(json: &[u8]) -> Option<f64> {
     let json: serde_json::Value = serde_json::from_slice(json).ok()?;
     let number = |value: &serde_json::Value| value["duration"].as_str()?.parse::<f64>().ok();
@@ -120,14 +120,14 @@ fn duration_s(json: &[u8]) -> Option<f64> {
 fn absent(program: &str, error: &std::io::Error) -> anyhow::Error {
     if error.kind() == ErrorKind::NotFound {
         return anyhow!(
-            "a video is read by the program {program}, which is not installed; `apt-get install ffmpeg` brings it, \
+            "a video is read by the program {program}, which is not installed; run `apt-get install ffmpeg`, \
              or give a folder of photos"
         );
     }
     anyhow!("cannot start {program}: {error}")
 }
 
-/// ffmpeg, and what it prints.
+/// Running ffmpeg process and its output.
 struct Decoder {
     ffmpeg: Child,
     stream: Y4m,
@@ -138,7 +138,7 @@ impl Decoder {
     fn start(file: &Path, width_px: u32) -> Result<Self> {
         let mut command = Command::new("ffmpeg");
         command.args(["-nostdin", "-v", "error", "-i"]).arg(file).args(["-map", "0:v:0", "-vf"]);
-        // As JPEG has it: BT.601, all 256 levels.
+        // Colour space of JPEG: BT.601, full range.
         command.arg(format!(
             "scale=w='min({width_px},iw)':h=-2:out_color_matrix=bt601:out_range=full,format=yuv444p"
         ));
@@ -148,7 +148,7 @@ impl Decoder {
         Ok(Self { ffmpeg, stream: Y4m::default(), buffer: vec![0; 1 << 18] })
     }
 
-    /// Returns the next picture and how many come a second; `None` at the end.
+    /// Returns the next picture and the frame rate [Hz]; `None` at the end.
     fn next(&mut self) -> Result<Option<(f64, Colours)>> {
         loop {
             if let Some(image) = self.stream.poll_colours().map_err(anyhow::Error::msg)? {
@@ -172,7 +172,7 @@ impl Decoder {
     fn said(&mut self) -> String {
         let mut said = String::new();
         if let Some(mut stderr) = self.ffmpeg.stderr.take() {
-            // What can be read is told.
+            // A read error must not hide the output that was read.
             let _ = stderr.read_to_string(&mut said);
         }
         said.trim().to_owned()
@@ -181,15 +181,15 @@ impl Decoder {
 
 impl Drop for Decoder {
     fn drop(&mut self) {
-        // Without effect on one that has ended.
+        // These have no effect on a process that has ended.
         let _ = self.ffmpeg.kill();
         let _ = self.ffmpeg.wait();
     }
 }
 
-/// Blocks are hardly seen.
+/// Quality at which block artefacts are hardly visible.
 const JPEG_QUALITY: u8 = 95;
-/// Fewer share nothing.
+/// Minimum number of pictures.
 const LEAST_PICTURES: usize = 8;
 
 #[cfg(test)]
@@ -197,7 +197,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_length_is_the_pictures_own_or_the_files() {
+    fn prefers_the_duration_of_the_stream() {
         let of = |text: &str| duration_s(text.as_bytes());
         let stream =
             r#"{"programs":[],"streams":[{"duration":"50.000000"}],"format":{"duration":"50.1"}}"#;

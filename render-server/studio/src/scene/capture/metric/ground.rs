@@ -1,5 +1,5 @@
-//! Where a capture stands whose tags nobody measured: upright by its floor, to size by a tape or the tags' own, else
-//! guessed; or by the motion capture that followed the camera.
+//! World frame of a capture without surveyed tags. The floor defines the vertical axis. The scale comes from a measured
+//! length or the size of the tags, otherwise it is guessed. Alternatively, a motion capture track defines all of it.
 
 use glam::{DQuat, DVec3};
 use vizflyt_twin::adjust::{Adjusted, Capture};
@@ -10,20 +10,20 @@ use vizflyt_twin::align::{Fit, Similarity};
 use super::{Length, Room};
 use crate::scene::capture::prints::Seen;
 
-/// Takes an adjusted capture to the world.
+/// World frame of an adjusted capture.
 #[derive(Clone, Debug)]
 pub(super) struct Ground {
-    /// From the adjustment's world to the world.
+    /// Transform from the adjustment's frame to the world.
     pub(super) place: Similarity,
     pub(super) scale_from: String,
     pub(super) scale_is_guessed: bool,
     pub(super) up_from: String,
-    /// What the adjustment does not know.
+    /// Uncertainty of the quantities that the adjustment does not determine.
     pub(super) fit: Option<Fit>,
 }
 
 impl Ground {
-    /// Takes what a motion capture says.
+    /// Returns the world frame of a motion capture track.
     pub(super) fn of_track(fit: Fit) -> Self {
         let track = "the motion capture's track".to_owned();
         Self {
@@ -35,10 +35,10 @@ impl Ground {
         }
     }
 
-    /// Finds what the adjustment leaves open.
+    /// Determines the quantities that the adjustment leaves open.
     pub(super) fn of(capture: &Capture, adjusted: &Adjusted, seen: &Seen, room: &Room) -> Self {
         if adjusted.known.place {
-            let measured = "where tags were measured to stand".to_owned();
+            let measured = "the surveyed positions of the tags".to_owned();
             return Self {
                 place: IDENTITY,
                 scale_from: measured.clone(),
@@ -56,7 +56,7 @@ impl Ground {
         let hand = cameras.iter().map(|held| held.up).sum::<DVec3>().normalize_or(DVec3::Z);
         let (up, up_from) = match level {
             Some(level) => (level.up, format!("the floor, by {} points", level.points)),
-            None => (hand, "how the camera was held: no floor was found".to_owned()),
+            None => (hand, "the attitude of the camera, because no floor was found".to_owned()),
         };
         let mut heights: Vec<f64> = cameras.iter().map(|held| up.dot(held.position)).collect();
         heights.sort_by(f64::total_cmp);
@@ -69,20 +69,20 @@ impl Ground {
             }
             (None, true, _) => {
                 let sigma = adjusted.scale_sigma.unwrap_or(GUESS_SHARE);
-                (1.0, sigma, "the tags' own size".to_owned())
+                (1.0, sigma, "the size of the tags".to_owned())
             }
             (None, false, Some(level)) => {
                 let height = hand_height - level.height;
                 let from =
-                    format!("taking it that the camera was carried {HAND_M} m above the floor");
+                    format!("the assumption that the camera was carried {HAND_M} m above the floor");
                 (HAND_M / height.max(1e-9), GUESS_SHARE, from)
             }
             (None, false, None) => {
-                (1.0, GUESS_SHARE, "taking a unit of the model for a metre".to_owned())
+                (1.0, GUESS_SHARE, "the assumption that a unit of the model is a metre".to_owned())
             }
         };
         let upright = DQuat::from_rotation_arc(up, DVec3::Z);
-        // The first picture looks along x, from above the origin.
+        // The first picture is above the origin and looks along x.
         let ahead = adjusted
             .world_from_cam
             .first()
@@ -113,8 +113,8 @@ impl Ground {
     }
 }
 
-/// Returns what the adjustment's lengths are multiplied by, and its sigma as a share, by a length between the middles of
-/// two tags; `None` if either is not seen from two places.
+/// Returns the scale of the adjustment and its relative sigma, from the measured distance between the centres of two
+/// tags. `None` if one of them is not seen from two positions.
 fn tape(capture: &Capture, adjusted: &Adjusted, seen: &Seen, length: Length) -> Option<(f64, f64)> {
     let middle = |id: u32| {
         let mut rays: [Vec<Ray>; 4] = Default::default();
@@ -138,11 +138,11 @@ fn tape(capture: &Capture, adjusted: &Adjusted, seen: &Seen, length: Length) -> 
 
 const IDENTITY: Similarity =
     Similarity { scale: 1.0, rotation: DQuat::IDENTITY, translation_m: DVec3::ZERO };
-/// A phone before the chest. [m]
+/// Assumed height of a phone that is held in front of the chest. [m]
 const HAND_M: f64 = 1.45;
-/// 1.2 to 1.7 m are two sigmas.
+/// Relative sigma of a guessed scale: heights of 1.2 to 1.7 m are within two sigmas.
 const GUESS_SHARE: f64 = 0.1;
-/// A tape from middle to middle of two sheets of paper, and both middles as pictures have them. [m]
+/// Standard deviation of the measured distance between two sheets of paper, including the centres in pictures. [m]
 const TAPE_SIGMA_M: f64 = 0.004;
 /// Floors are level to about 3 mm over 2 m (DIN 18202, table 3). [rad]
 const FLOOR_TILT_RAD: f64 = 0.0015;

@@ -1,4 +1,4 @@
-//! COLMAP as a program in the PATH, 3.8 and later.
+//! COLMAP as a program in the PATH, version 3.8 and later.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -8,16 +8,16 @@ use anyhow::Result;
 use super::tool::ask;
 use super::{Finder, Job, Phase, Tool, UNKNOWN_LENS};
 
-/// The program.
+/// COLMAP program.
 pub(super) struct Colmap {
     program: PathBuf,
     name: String,
-    /// "Sift" until 3.12, "Feature" since: what options of features begin with.
+    /// Prefix of feature options: "Sift" until 3.12, then "Feature".
     prefix: &'static str,
 }
 
 impl Colmap {
-    /// Asks the program for its version; `None` if it is not installed.
+    /// Runs the program to read its version; `None` if it is not installed.
     pub(super) fn open(program: &Path) -> Option<Self> {
         let help = ask(Command::new(program).arg("help"))?;
         let options =
@@ -29,7 +29,7 @@ impl Colmap {
     }
 }
 
-/// Returns "COLMAP 3.8" of what `colmap help` prints first.
+/// Returns the name and version from the output of `colmap help`, such as "COLMAP 3.8".
 fn version(help: &str) -> Option<String> {
     let line = help.lines().find(|line| line.starts_with("COLMAP "))?;
     let mut words = line.split_whitespace();
@@ -48,7 +48,7 @@ impl Finder for Colmap {
         let command = |what: &str| {
             let mut command = Command::new(&self.program);
             command.arg(what).arg("--database_path").arg(&database);
-            // Without a desktop: Qt needs none then.
+            // With this platform, Qt needs no display.
             command.env("QT_QPA_PLATFORM", "offscreen");
             command
         };
@@ -84,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_version_is_in_the_first_line() {
+    fn reads_the_version_from_the_help() {
         let help =
             "COLMAP 3.8 -- Structure-from-Motion and Multi-View Stereo\n  (Commit Unknown)\n";
         assert_eq!(version(help).as_deref(), Some("COLMAP 3.8"));

@@ -1,9 +1,10 @@
-"""Finds where pictures were taken from, by pycolmap; what `vizflyt scene capture` runs.
+"""Estimates camera poses of pictures with pycolmap. `vizflyt scene capture` runs this script.
 
     python find_poses.py IMAGES PAIRS FOLDER MODELS LENS PARAMETERS
 
-IMAGES is a folder; PAIRS a file with two names a line. FOLDER takes the database, MODELS a folder 0, 1, ... of each
-model that was found. LENS is COLMAP's name of one, PARAMETERS its numbers with commas, or '' to find them.
+IMAGES is the folder of the pictures. PAIRS is a file with two names per line. The database is written to FOLDER, and
+each model to a folder MODELS/0, MODELS/1, ... LENS is a camera model of COLMAP. PARAMETERS are its numbers, separated
+by commas, or '' to estimate them.
 """
 
 import sys
@@ -12,7 +13,7 @@ import pycolmap
 
 
 def main(images: str, pairs: str, folder: str, models: str, lens: str, parameters: str) -> None:
-    # The same pictures, the same poses.
+    # The same pictures give the same poses.
     pycolmap.set_random_seed(1)
     database = folder + "/database.db"
     reader = pycolmap.ImageReaderOptions()
@@ -27,7 +28,7 @@ def main(images: str, pairs: str, folder: str, models: str, lens: str, parameter
 
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = pairs
-    # Progress is told by blocks.
+    # Progress is printed per block.
     pairing.block_size = 100
     pycolmap.match_image_pairs(database, pairing_options=pairing)
 

@@ -1,4 +1,4 @@
-//! Poses that exist already.
+//! Existing poses of `--poses`.
 
 use std::path::Path;
 
@@ -7,24 +7,24 @@ use vizflyt_twin::dataset::colmap;
 
 use super::{Model, Poses};
 
-/// Takes the models of a dataset: `sparse/0`, `sparse/1`, ... of COLMAP.
+/// Reads the models of a dataset: `sparse/0`, `sparse/1`, ... of COLMAP.
 ///
 /// # Errors
-/// There is none, or it is of another program.
+/// The dataset has no model, or is not of COLMAP.
 pub(in super::super) fn take_given(dataset: &Path) -> Result<Poses> {
     let mut models = super::models(&dataset.join("sparse"))?;
     if models.is_empty() {
         if dataset.join("transforms.json").is_file() {
             bail!(
-                "{} has nerfstudio's poses, without what the pictures saw, by which poses are made metric and checked; \
-                 give the folder of COLMAP that `ns-process-data` made beside it (colmap/), or train as it is: \
+                "{} has nerfstudio's poses, without the points and observations that scale and verdict need; \
+                 give the folder of COLMAP that `ns-process-data` wrote next to it (colmap/), or train directly: \
                  `vizflyt scene train`, then `vizflyt scene align`",
                 dataset.display()
             );
         }
         let Some(folder) = colmap::find(dataset) else {
             bail!(
-                "{} holds no poses: cameras, images and points3D of COLMAP, in sparse/0 or itself",
+                "{} contains no poses: expected cameras, images and points3D of COLMAP, in sparse/0 or directly",
                 dataset.display()
             );
         };

@@ -1,17 +1,17 @@
-//! What COLMAP and pycolmap say while they work.
+//! Parser for the output of COLMAP and pycolmap.
 
-/// How far a tool is.
+/// Progress of a tool.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Phase {
-    /// Features of so many pictures are found.
+    /// Number of pictures with extracted features.
     Features { done: usize, of: usize },
-    /// This block of pairs is being compared, from 1.
+    /// Current block of pairs, from 1.
     Matching { done: usize, of: usize },
-    /// So many pictures are placed.
+    /// Number of placed pictures.
     Placing { done: usize },
 }
 
-/// Returns what a line says of the progress, of COLMAP 3.8 to 4.2; `None` of other lines.
+/// Returns the progress from a line of COLMAP 3.8 to 4.2; `None` for other lines.
 pub(super) fn phase(line: &str) -> Option<Phase> {
     if let Some(rest) = after(line, "Processed file [") {
         let [done, of] = share(rest)?;
@@ -29,7 +29,7 @@ pub(super) fn phase(line: &str) -> Option<Phase> {
     Some(Phase::Placing { done: leading(digits)? })
 }
 
-/// Returns the last line that names an error, for people.
+/// Returns the text of the last line with an error; without one, the last line that is not empty.
 pub(super) fn error(log: &str) -> Option<&str> {
     let is_error = |line: &&str| {
         let glog = line.starts_with('E') || line.starts_with('F');
@@ -49,7 +49,7 @@ fn after<'a>(line: &'a str, mark: &str) -> Option<&'a str> {
     line.split_once(mark).map(|(_, rest)| rest)
 }
 
-/// Reads "3/100" or "1/2, 1/2", of which the first counts.
+/// Parses "3/100" or "1/2, 1/2", of which the first part counts.
 fn share(text: &str) -> Option<[usize; 2]> {
     let (done, rest) = text.split_once('/')?;
     Some([done.trim().parse().ok()?, leading(rest)?])
@@ -65,13 +65,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_of_both_tools_are_understood() {
+    fn parses_progress_of_both_tools() {
         let head = "I20261123 23:16:54.711333 140452787373760 feature_extraction.cc:270] ";
         for (line, expected) in [
             ("Processed file [3/100]", Some(Phase::Features { done: 3, of: 100 })),
             ("Processing block [2/4, 1/4]", Some(Phase::Matching { done: 2, of: 4 })),
             ("Processing block [7/9]", Some(Phase::Matching { done: 7, of: 9 })),
-            // Of 3.8.
+            // COLMAP 3.8.
             ("Matching block [1/4] in 3.2s", Some(Phase::Matching { done: 1, of: 4 })),
             ("Registering image #12 (num_reg_frames=34)", Some(Phase::Placing { done: 34 })),
             ("Registering image #12 (34)", Some(Phase::Placing { done: 34 })),
@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn the_error_is_found_among_the_rest() {
+    fn finds_the_last_error() {
         let log =
             "I2026 1 a.cc:1] fine\nE2026 2 b.cc:2] Cannot open the database\nI2026 3 c.cc:3] bye\n";
         assert_eq!(error(log), Some("Cannot open the database"));

@@ -1,5 +1,5 @@
-//! The second stage: where pictures were taken from. Structure from motion is the work of others' programs; what is ours
-//! is which pictures they compare, and that their word is not taken for it (`vizflyt_twin::verdict`).
+//! Third stage: estimates the camera poses. External programs do the structure from motion. This module selects the
+//! pairs of pictures to compare; `vizflyt_twin::verdict` checks the result.
 
 mod colmap;
 mod given;
@@ -22,53 +22,53 @@ use super::images::Pictures;
 use super::prints::Seen;
 use crate::scene::progress::Progress;
 
-/// What finds poses. Whatever it is, it leaves folders with COLMAP's files.
+/// Program that estimates poses. Its results are folders with COLMAP's files.
 trait Finder {
-    /// Returns its name and version, for reports.
+    /// Returns name and version for reports.
     fn name(&self) -> &str;
 
-    /// Finds poses of the pictures; leaves every model that it finds in a folder of its own below `job.models`.
+    /// Estimates the poses of the pictures. Writes each model into a separate folder below `job.models`.
     fn find(&self, job: &Job<'_>, progress: &mut dyn FnMut(Phase)) -> Result<()>;
 }
 
-/// What there is to find.
+/// Inputs and output folders of a program.
 struct Job<'a> {
     /// Folder with the pictures.
     images: &'a Path,
-    /// How many there are.
+    /// Number of pictures.
     count: usize,
-    /// The lens, if it is known; then it is not refined.
+    /// Calibrated lens: name and parameters of COLMAP. It is not refined.
     lens: Option<(&'static str, String)>,
-    /// A file with the names of two pictures a line: those to compare.
+    /// File with the pairs to compare: two names per line.
     pairs: &'a Path,
-    /// How many.
+    /// Number of pairs.
     pair_count: usize,
-    /// Where the tool may write what it needs.
+    /// Folder for temporary files and the log.
     folder: &'a Path,
-    /// Where models go.
+    /// Output folder for models.
     models: &'a Path,
 }
 
-/// What the stage leaves.
+/// Result of the stage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Poses {
-    /// Who found them.
+    /// Name and version of the program.
     pub(super) tool: String,
-    /// Folders of models, that which places most pictures first.
+    /// Models; the one with the most placed pictures is first.
     pub(super) models: Vec<Model>,
 }
 
-/// Pictures that were placed together.
+/// Model of pictures in a common frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Model {
     pub(super) folder: PathBuf,
     pub(super) placed: usize,
 }
 
-/// Returns the models below a folder, that which places most pictures first.
+/// Returns the models below a folder; the one with the most placed pictures is first.
 ///
 /// # Errors
-/// One that cannot be read.
+/// A model cannot be read.
 fn models(folder: &Path) -> Result<Vec<Model>> {
     let mut models = Vec::new();
     for number in 0.. {
@@ -83,10 +83,10 @@ fn models(folder: &Path) -> Result<Vec<Model>> {
     Ok(models)
 }
 
-/// Finds poses by a program that is installed here.
+/// Estimates poses with an installed program.
 ///
 /// # Errors
-/// None is installed, or it fails.
+/// No program is installed, or it fails.
 pub(super) fn find(
     pictures: &Pictures,
     seen: &Seen,
@@ -118,22 +118,22 @@ pub(super) fn find(
     let models = models(&models_folder)?;
     if models.is_empty() {
         bail!(
-            "{} places no pictures: they share too little; film slowly, sideways past what has texture",
+            "{} cannot place any picture: they overlap too little; film slowly, sideways past textured surfaces",
             finder.name()
         );
     }
     Ok(Poses { tool: finder.name().to_owned(), models })
 }
 
-/// Checks that poses can be found here at all.
+/// Checks that a program for poses is installed.
 ///
 /// # Errors
-/// Nothing that finds poses is installed: what to install.
+/// No program is installed. The message explains the installation.
 pub(super) fn check_installed(python: Option<&Path>) -> Result<()> {
     installed(python).map(drop)
 }
 
-/// Returns what is installed: pycolmap first, which `pip` brings in its newest version.
+/// Returns an installed program. pycolmap has precedence, because `pip` installs its newest version.
 fn installed(python: Option<&Path>) -> Result<Box<dyn Finder>> {
     if let Some(python) = python {
         return Ok(Box::new(pycolmap::Pycolmap::open(python)?));
@@ -150,23 +150,23 @@ fn installed(python: Option<&Path>) -> Result<Box<dyn Finder>> {
         return Ok(Box::new(found));
     }
     bail!(
-        "where the pictures were taken from is found by COLMAP, which is not installed; get one of these:\n  \
+        "camera poses are estimated by COLMAP, which is not installed; install one of these:\n  \
          python3 -m venv venv && venv/bin/pip install pycolmap     then give --python venv/bin/python\n  \
          apt-get install colmap                                    an older version, in the PATH\n\
-         or give poses that exist already: --poses DATASET, of COLMAP or nerfstudio"
+         or give existing poses: --poses DATASET, of COLMAP or nerfstudio"
     )
 }
 
-/// Returns COLMAP's name for a lens, and its parameters as it reads them.
+/// Returns COLMAP's name and parameters of a lens.
 fn lens_text(k: &Intrinsics) -> (&'static str, String) {
     let (model, numbers) = colmap_files::parameters(k);
     (model, numbers.iter().map(f64::to_string).collect::<Vec<_>>().join(","))
 }
 
-/// The lens that is estimated where none is known: one focal length, two terms of distortion.
+/// Lens model to estimate if the lens is not calibrated: one focal length, two terms of distortion.
 const UNKNOWN_LENS: &str = "RADIAL";
 
-/// Shows how far a finder is.
+/// Progress display of a finder.
 struct Phases {
     progress: Progress,
     phase: Option<std::mem::Discriminant<Phase>>,
@@ -183,7 +183,7 @@ impl Phases {
     fn show(&mut self, phase: Phase) {
         let kind = std::mem::discriminant(&phase);
         if self.phase.replace(kind) != Some(kind) {
-            // Each takes its own time.
+            // Each phase has a separate time estimate.
             self.progress = Progress::new("");
         }
         let share = |done: usize, of: usize| done as f64 / of.max(1) as f64;
@@ -193,7 +193,7 @@ impl Phases {
                     .show(share(done, of), || format!("features of picture {done} of {of}"));
             }
             Phase::Matching { done, of } => {
-                // A block that is begun is not done.
+                // The current block is not finished.
                 let done = done.saturating_sub(1);
                 let pairs = done * self.pair_count / of.max(1);
                 self.progress.show(share(done, of), || {

@@ -1,4 +1,4 @@
-//! COLMAP as a package of Python: `pip install pycolmap`, 4.0 and later; 3.x has other names for what is asked here.
+//! COLMAP as a Python package: `pip install pycolmap`, version 4.0 and later; 3.x has other names in its API.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -8,17 +8,17 @@ use anyhow::{Context, Result};
 use super::tool::ask;
 use super::{Finder, Job, Phase, Tool, UNKNOWN_LENS};
 
-/// A Python that has it.
+/// Python interpreter with pycolmap.
 pub(super) struct Pycolmap {
     python: PathBuf,
     name: String,
 }
 
 impl Pycolmap {
-    /// Asks a Python for its pycolmap.
+    /// Checks that an interpreter has pycolmap, and reads its version.
     ///
     /// # Errors
-    /// It has none.
+    /// The interpreter has no pycolmap of version 4.
     pub(super) fn open(python: &Path) -> Result<Self> {
         let version = ask(Command::new(python).args(["-c", VERSION]));
         let version = version.with_context(|| {
@@ -48,7 +48,7 @@ impl Finder for Pycolmap {
     }
 }
 
-/// Names that the script needs are asked for too.
+/// Also checks the names that the script needs.
 const VERSION: &str = "import pycolmap; pycolmap.FeatureExtractionOptions, pycolmap.match_image_pairs; \
                        print(pycolmap.__version__)";
 const SCRIPT: &str = include_str!("find_poses.py");

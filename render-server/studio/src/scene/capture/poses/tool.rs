@@ -1,4 +1,4 @@
-//! A program that is started, listened to, and whose failure is told in its own words.
+//! Runs an external program, reads its progress, and returns its error output if it fails.
 
 use std::io::{BufRead, BufReader, ErrorKind, Write};
 use std::path::Path;
@@ -8,14 +8,14 @@ use anyhow::{Context, Result, anyhow, bail};
 
 use super::log::{self, Phase};
 
-/// What is run, and where all that it says is kept.
+/// Name of a program, and log file for its output.
 pub(super) struct Tool<'a> {
     pub(super) name: &'a str,
     pub(super) log: &'a Path,
 }
 
 impl Tool<'_> {
-    /// Runs a command to its end; ends it where this ends early.
+    /// Runs a command to its end. Kills it if this function returns early.
     ///
     /// # Errors
     /// It cannot be started, or it fails.
@@ -25,7 +25,7 @@ impl Tool<'_> {
             .append(true)
             .open(self.log)
             .with_context(|| format!("cannot write {}", self.log.display()))?;
-        // Both streams in one pipe: neither can fill while the other is read.
+        // Both streams share a pipe, so that none can fill up while the other is read.
         let (reader, writer) = std::io::pipe().context("cannot make a pipe")?;
         let child = {
             let twin = writer.try_clone().context("cannot make a pipe")?;
@@ -33,7 +33,7 @@ impl Tool<'_> {
         };
         let mut child =
             Ended(child.map_err(|error| anyhow!("cannot start {}: {error}", self.name))?);
-        // The command holds the writing ends too.
+        // The command also holds the write ends; close them.
         command.stdout(Stdio::null()).stderr(Stdio::null());
         let mut reader = BufReader::new(reader);
         let mut line = Vec::new();
@@ -48,7 +48,7 @@ impl Tool<'_> {
                     return Err(error).with_context(|| format!("cannot read from {}", self.name));
                 }
             }
-            // A log that cannot be written is no reason to stop.
+            // A write error of the log must not stop the program.
             let _ = file.write_all(&line);
             let text = String::from_utf8_lossy(&line);
             if let Some(phase) = log::phase(&text) {
@@ -61,9 +61,9 @@ impl Tool<'_> {
         }
         let status = child.0.wait().with_context(|| format!("cannot wait for {}", self.name))?;
         if !status.success() {
-            let said = log::error(&tail).unwrap_or("it says nothing").to_owned();
+            let said = log::error(&tail).unwrap_or("no output").to_owned();
             bail!(
-                "{} failed ({status}): {said}\nall that it said is in {}",
+                "{} failed ({status}): {said}\nits complete output is in {}",
                 self.name,
                 self.log.display()
             );
@@ -72,23 +72,23 @@ impl Tool<'_> {
     }
 }
 
-/// A child that does not outlive this.
+/// Child process that is killed on drop.
 struct Ended(Child);
 
 impl Drop for Ended {
     fn drop(&mut self) {
-        // Without effect on one that has ended.
+        // These have no effect on a process that has ended.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
-/// Returns what a short command prints; `None` if it is not installed or fails.
+/// Returns the output of a short command; `None` if it is not installed or fails.
 pub(super) fn ask(command: &mut Command) -> Option<String> {
     let output = command.stdin(Stdio::null()).output().ok()?;
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     output.status.success().then_some(text)
 }
 
-/// What an error is looked for in.
+/// Size of the last part of the output in which an error is searched.
 const TAIL_BYTES: usize = 64 << 10;
