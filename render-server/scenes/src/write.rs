@@ -27,10 +27,7 @@ pub struct Written {
 pub enum WriteError {
     /// The folder or a text file could not be written.
     #[error("cannot write {}: {cause}; give a folder on a disk with enough space", path.display())]
-    Io {
-        path: PathBuf,
-        cause: io::Error,
-    },
+    Io { path: PathBuf, cause: io::Error },
     /// The splats could not be written.
     #[error(transparent)]
     Splats(#[from] ply::PlyError),

@@ -72,7 +72,8 @@ impl CourseInstance {
         hash.update(rules);
         let field = Arc::new(baked.field);
         let truth = Some(&generated.truth).filter(|_| generated.map_is_known);
-        let map = truth.map(serde_json::to_string).transpose().context("the map cannot be serialized")?;
+        let map =
+            truth.map(serde_json::to_string).transpose().context("the map cannot be serialized")?;
         let obstacles = obstacles(&generated.arena, &generated.objects, field.clone(), seed);
         Ok(Self {
             scene_sha256: hash_of(&generated.splats, &generated.objects, &environment)?,
@@ -110,7 +111,9 @@ fn hash_of(
         })
     {
         // Weather is hashed as its text: the same numbers give the same text.
-        hash.update(serde_json::to_string(environment).context("the weather cannot be serialized")?);
+        hash.update(
+            serde_json::to_string(environment).context("the weather cannot be serialized")?,
+        );
     }
     Ok(hex(&hash.finalize()))
 }

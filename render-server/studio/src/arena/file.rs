@@ -92,7 +92,8 @@ where
         None => Vec::new(),
         Some(Item::ArrayOfTables(old)) => old.iter().cloned().collect(),
         Some(item) => {
-            let array = item.as_array().with_context(|| format!("{key} is not a list of tables"))?;
+            let array =
+                item.as_array().with_context(|| format!("{key} is not a list of tables"))?;
             let inline = array.iter().filter_map(Value::as_inline_table);
             inline.cloned().map(InlineTable::into_table).collect()
         }

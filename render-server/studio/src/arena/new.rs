@@ -84,7 +84,10 @@ fn from_folder(folder: &Path, file: &Path) -> Result<String> {
     };
     let way = way(&real(folder)?, &real(file)?);
     let text = way.to_str().with_context(|| {
-        format!("the path {} is not valid UTF-8, which arena.toml requires; rename the file", way.display())
+        format!(
+            "the path {} is not valid UTF-8, which arena.toml requires; rename the file",
+            way.display()
+        )
     })?;
     Ok(text.to_owned())
 }

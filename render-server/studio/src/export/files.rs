@@ -27,8 +27,9 @@ impl Folder {
             "{} already exists; nothing is overwritten: give another folder, or delete it",
             target.display()
         );
-        let name =
-            target.file_name().with_context(|| format!("{} is not the name of a folder", target.display()))?;
+        let name = target
+            .file_name()
+            .with_context(|| format!("{} is not the name of a folder", target.display()))?;
         let mut part = name.to_owned();
         part.push(".part");
         let part = target.with_file_name(part);

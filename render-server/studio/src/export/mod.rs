@@ -108,7 +108,9 @@ pub fn run(args: &ExportArgs) -> Result<ExitCode> {
         print_line(format!("sensors     {readings} readings, in {above}NAME"));
     }
     if motion.is_cut {
-        print_line("note        the log is incomplete: its flight was killed, or the file is damaged");
+        print_line(
+            "note        the log is incomplete: its flight was killed, or the file is damaged",
+        );
     }
     print_line(format!("folder      {}", args.output.display()));
     Ok(ExitCode::SUCCESS)

@@ -26,7 +26,8 @@ pub(super) fn write(
     let mut rows: Vec<Row> = Vec::new();
     let (mut rgb, mut depth, mut both) = (list("color images"), list("depth maps"), String::new());
     let mut shown =
-        "# camera pose from which each image was rendered: timestamp tx ty tz qx qy qz qw\n".to_owned();
+        "# camera pose from which each image was rendered: timestamp tx ty tz qx qy qz qw\n"
+            .to_owned();
     while let Some(mut image) =
         pictures.next(|image| chosen.as_ref().is_none_or(|name| *name == image.camera))?
     {

@@ -220,8 +220,6 @@ position_m = [0, 0, 0]
         assert!(run(&args).unwrap_err().to_string().contains("no such camera; there are front"));
         args.from = 0.6;
         args.camera = None;
-        assert!(
-            run(&args).unwrap_err().to_string().contains("--from 0.6 s is after its end")
-        );
+        assert!(run(&args).unwrap_err().to_string().contains("--from 0.6 s is after its end"));
     }
 }

@@ -85,8 +85,7 @@ impl Aligner for Clicked {
         if !has_scale {
             // Without a known scale, values in metres are meaningless.
             lines.clear();
-            let text =
-                "unknown: click both ends of a measured length".to_owned();
+            let text = "unknown: click both ends of a measured length".to_owned();
             lines.push(Line { key: "scale", text });
         }
         Ok(Solved { place, lines, go: has_scale.then_some(is_known) })

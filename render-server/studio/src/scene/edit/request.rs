@@ -82,15 +82,10 @@ pub(super) struct Requests(pub(super) Vec<Request>);
 type Flag = (&'static str, &'static str, &'static str, fn(&str) -> Result<Request, String>);
 
 const FLAGS: [Flag; 17] = [
-    (
-        "crop-box",
-        "MIN:MAX",
-        "Keep only a box along the scene's axes: X,Y,Z:X,Y,Z",
-        |text| Ok(crop(boxed(text)?)),
-    ),
-    ("crop-sphere", "CENTER:RADIUS", "Keep only a sphere: X,Y,Z:R", |text| {
-        Ok(crop(sphere(text)?))
+    ("crop-box", "MIN:MAX", "Keep only a box along the scene's axes: X,Y,Z:X,Y,Z", |text| {
+        Ok(crop(boxed(text)?))
     }),
+    ("crop-sphere", "CENTER:RADIUS", "Keep only a sphere: X,Y,Z:R", |text| Ok(crop(sphere(text)?))),
     (
         "crop-prism",
         "AXIS:LOW,HIGH:P:P:P...",
@@ -98,12 +93,8 @@ const FLAGS: [Flag; 17] = [
         |text| Ok(crop(prism(text)?)),
     ),
     ("remove-box", "MIN:MAX", "Remove a box", |text| Ok(remove(boxed(text)?))),
-    ("remove-sphere", "CENTER:RADIUS", "Remove a sphere", |text| {
-        Ok(remove(sphere(text)?))
-    }),
-    ("remove-prism", "AXIS:LOW,HIGH:P:P:P...", "Remove a prism", |text| {
-        Ok(remove(prism(text)?))
-    }),
+    ("remove-sphere", "CENTER:RADIUS", "Remove a sphere", |text| Ok(remove(sphere(text)?))),
+    ("remove-prism", "AXIS:LOW,HIGH:P:P:P...", "Remove a prism", |text| Ok(remove(prism(text)?))),
     ("min-opacity", "OPACITY", "Remove splats with a lower opacity, 0 to 1", |text| {
         Ok(Request::Step(EditStep::Faint { below: number(text)? }))
     }),
@@ -134,19 +125,31 @@ const FLAGS: [Flag; 17] = [
         "Keep only this number or percentage of splats: the most opaque and largest",
         share,
     ),
-    ("up", "AXIS", "Rotate the scene so that this axis becomes +z: x, -x, y, -y, z or -z", |text| {
-        let up = Up::from_str(text).map_err(|error| error.to_string())?;
-        Ok(Request::Step(EditStep::Turn { rotation: up.world_from_scene().to_array() }))
-    }),
-    ("rotate", "X,Y,Z", "Rotate the scene about x, then y, then z, counter-clockwise [deg]", |text| {
-        let rad = DVec3::from(point(text)?).map(f64::to_radians);
-        let rotation = DQuat::from_euler(EulerRot::ZYX, rad.z, rad.y, rad.x).to_array();
-        Ok(Request::Step(EditStep::Turn { rotation }))
-    }),
+    (
+        "up",
+        "AXIS",
+        "Rotate the scene so that this axis becomes +z: x, -x, y, -y, z or -z",
+        |text| {
+            let up = Up::from_str(text).map_err(|error| error.to_string())?;
+            Ok(Request::Step(EditStep::Turn { rotation: up.world_from_scene().to_array() }))
+        },
+    ),
+    (
+        "rotate",
+        "X,Y,Z",
+        "Rotate the scene about x, then y, then z, counter-clockwise [deg]",
+        |text| {
+            let rad = DVec3::from(point(text)?).map(f64::to_radians);
+            let rotation = DQuat::from_euler(EulerRot::ZYX, rad.z, rad.y, rad.x).to_array();
+            Ok(Request::Step(EditStep::Turn { rotation }))
+        },
+    ),
     ("scale", "FACTOR", "Scale the scene by this factor", |text| {
         Ok(Request::Step(EditStep::Scale { factor: number(text)? }))
     }),
-    ("move", "X,Y,Z", "Translate the scene", |text| Ok(Request::Step(EditStep::Move { by: point(text)? }))),
+    ("move", "X,Y,Z", "Translate the scene", |text| {
+        Ok(Request::Step(EditStep::Move { by: point(text)? }))
+    }),
 ];
 
 impl clap::Args for Requests {
@@ -252,8 +255,9 @@ fn prism(text: &str) -> Result<Region, String> {
 fn cells(text: &str, usual: u32) -> Result<(Option<f64>, u32), String> {
     let (cell, count) = text.split_once(':').unwrap_or((text, ""));
     let cell = if cell.is_empty() { None } else { Some(number(cell)?) };
-    let wrong =
-        || format!("'{count}' is not a count; write the cell's side, a colon, and the count: 0.2:50");
+    let wrong = || {
+        format!("'{count}' is not a count; write the cell's side, a colon, and the count: 0.2:50")
+    };
     let count = if count.is_empty() { usual } else { count.parse().map_err(|_| wrong())? };
     // Checked here, because loading the scene takes long.
     let step = EditStep::Floaters { cell: cell.unwrap_or(1.0), least: count };
@@ -268,8 +272,9 @@ fn share(text: &str) -> Result<Request, String> {
         let wrong = || format!("'{text}' is not a share; give more than 0 % and up to 100 %");
         return is_meant.then_some(Request::Share(percent / 100.0)).ok_or_else(wrong);
     }
-    let count =
-        text.parse().map_err(|_| format!("'{text}' is not a count; give splats, or per cent: 50%"))?;
+    let count = text
+        .parse()
+        .map_err(|_| format!("'{text}' is not a count; give splats, or per cent: 50%"))?;
     Ok(Request::Step(EditStep::Decimate { count }))
 }
 

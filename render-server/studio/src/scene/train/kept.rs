@@ -41,7 +41,9 @@ impl Kept {
             return Ok(None);
         }
         if !self.path.exists() {
-            bail!("{path} does not exist: there is no interrupted training; omit --resume to start one");
+            bail!(
+                "{path} does not exist: there is no interrupted training; omit --resume to start one"
+            );
         }
         let bytes = std::fs::read(&self.path).with_context(|| format!("cannot read {path}"))?;
         Ok(Some(Checkpoint::from_bytes(&bytes).with_context(|| path.to_string())?))

@@ -73,8 +73,9 @@ impl Ground {
             }
             (None, false, Some(level)) => {
                 let height = hand_height - level.height;
-                let from =
-                    format!("the assumption that the camera was carried {HAND_M} m above the floor");
+                let from = format!(
+                    "the assumption that the camera was carried {HAND_M} m above the floor"
+                );
                 (HAND_M / height.max(1e-9), GUESS_SHARE, from)
             }
             (None, false, None) => {
