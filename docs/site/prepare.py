@@ -45,6 +45,12 @@ def led(name: str, text: str) -> str:
     return "".join(part if index % 2 else LINK.sub(lead, part) for index, part in enumerate(parts))
 
 
+def subcommands(text: str) -> list[str]:
+    """Returns the subcommands in a help text. They are listed before the options, under one heading or several."""
+    listed = text.partition("Usage:")[2].partition("\nOptions:")[0]
+    return [name for name in re.findall(r"^  ([a-z][\w-]*)(?=  |$)", listed, re.M) if name != "help"]
+
+
 def commands(program: str) -> str:
     """Returns a page with the help of every command."""
     parts = ["# Commands\n\nThe help of each command, as `vizflyt COMMAND --help` prints it.\n"]
@@ -56,10 +62,8 @@ def commands(program: str) -> str:
         text = subprocess.run(call, check=True, capture_output=True, text=True, env=environment).stdout
         level = "#" * min(max(len(names), 1) + 1, 4)
         parts.append(f"{level} {' '.join(('vizflyt', *names))}\n\n```text\n{text.rstrip()}\n```\n")
-        section = re.search(r"^Commands:\n(.*?)(?:^\S|\Z)", text, re.M | re.S)
-        for name in re.findall(r"^  ([a-z][\w-]*)", section[1], re.M) if section else []:
-            if name != "help":
-                add(*names, name)
+        for name in subcommands(text):
+            add(*names, name)
 
     add()
     return "\n".join(parts)

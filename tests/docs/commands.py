@@ -38,8 +38,9 @@ class Program:
         return self.known[names]
 
     def subcommands(self, *names: str) -> set[str]:
-        section = re.search(r"^Commands:\n(.*?)(?:^\S|\Z)", self.help(*names), re.M | re.S)
-        return set(re.findall(r"^  ([a-z][\w-]*)", section[1], re.M)) if section else set()
+        # Listed before the options, under one heading or several.
+        listed = self.help(*names).partition("Usage:")[2].partition("\nOptions:")[0]
+        return set(re.findall(r"^  ([a-z][\w-]*)(?=  |$)", listed, re.M))
 
     def options(self, *names: str) -> set[str]:
         text = self.help(*names)

@@ -30,76 +30,45 @@ use crate::wifi::WifiConfig;
                   vizflyt sim --pty /tmp/uart --baud 921600 --vicon 127.0.0.1:51001"
 )]
 pub struct SimArgs {
-    /// Endpoint of MAVLink; up to four, like telemetry ports of one autopilot
-    ///
-    /// udpout:HOST:PORT sends first, udpin:HOST:PORT and tcpin:HOST:PORT wait, tcpout:HOST:PORT connects;
-    /// serial:PATH[:BAUD] and pty:PATH[:BAUD] are like --serial and --pty. Default: udpout:127.0.0.1:14550, unless
-    /// --serial or --pty is given.
-    #[arg(long, value_name = "ENDPOINT")]
-    pub mavlink: Vec<Endpoint>,
-    /// Serial device, or existing pseudo-terminal, for MAVLink
-    ///
-    /// Waits until the device exists.
-    #[arg(long, value_name = "PATH")]
-    pub serial: Option<PathBuf>,
-    /// Create a pseudo-terminal for MAVLink, and a link to it with this name
-    #[arg(long, value_name = "PATH", conflicts_with = "serial")]
-    pub pty: Option<PathBuf>,
-    /// Baud rate of --serial and --pty; limits the speed of sending
-    #[arg(long, value_name = "BAUD", default_value_t = DEFAULT_BAUD, value_parser = parse_baud)]
-    pub baud: u32,
-    /// Destination of Vicon's UDP object stream; none if absent
-    #[arg(long, value_name = "HOST:PORT", value_parser = parse_address)]
-    pub vicon: Option<SocketAddr>,
-    /// Destination of another motion capture format; may be repeated
-    ///
-    /// Formats: vicon, json or mavlink with a destination; natnet with the address where Motive waits for listeners, or
-    /// with a multicast group.
-    #[arg(long, value_name = "FORMAT:HOST:PORT")]
-    pub mocap: Vec<FeedTarget>,
-    /// Destination of the true pose at every tick; may be repeated
-    ///
-    /// Sends the JSON that `vizflyt serve` reads poses from, with the instant on CLOCK_MONOTONIC. `vizflyt tags locate`
-    /// renders the images of its simulated cameras from it.
-    #[arg(long, value_name = "HOST:PORT", value_parser = parse_address)]
-    pub truth_to: Vec<SocketAddr>,
-    /// Name of the vehicle in the motion capture
-    #[arg(long, value_name = "NAME", default_value = "vizflyt", value_parser = parse_object)]
-    pub object: String,
-    /// Start of the vehicle: position on the floor [m], yaw from east [degrees]
-    #[arg(long, value_name = "X,Y,Z,YAW", default_value = "0,0,0,0", value_parser = parse_numbers::<4>, allow_hyphen_values = true)]
-    pub spawn: [f64; 4],
-    /// Seed of all noise
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
     /// True geometry of the scene, for clearance (JSON list of volumes)
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Scene", value_name = "FILE")]
     pub truth: Option<PathBuf>,
     /// Radius of the vehicle's body, for clearance [m]
-    #[arg(long, value_name = "METRES", default_value_t = 0.12)]
+    #[arg(long, help_heading = "Scene", value_name = "METRES", default_value_t = 0.12)]
     pub body_radius: f64,
+    /// Steady wind, world axes [m/s]
+    #[arg(long, help_heading = "Scene", value_name = "X,Y,Z", default_value = "0,0,0", value_parser = parse_numbers::<3>, allow_hyphen_values = true)]
+    pub wind: [f64; 3],
+    /// Standard deviation of gusts along each horizontal axis [m/s]
+    #[arg(long, help_heading = "Scene", value_name = "M/S", default_value_t = 0.0)]
+    pub gusts: f64,
+    /// Start of the vehicle: position on the floor [m], yaw from east [degrees]
+    #[arg(long, help_heading = "Vehicle", value_name = "X,Y,Z,YAW", default_value = "0,0,0,0", value_parser = parse_numbers::<4>, allow_hyphen_values = true)]
+    pub spawn: [f64; 4],
+    /// Move the vehicle by hand instead of flying
+    ///
+    /// Repeats: lift, push forward, turn left, raise the nose, raise the left side. The IMU measures these motions.
+    /// `vizflyt doctor localization` needs them.
+    #[arg(long, help_heading = "Vehicle")]
+    pub hand: bool,
     /// Use the parameters of `hardware/airframe`
     ///
     /// Otherwise, the defaults of ArduCopter apply, which respond late to velocity setpoints.
-    #[arg(long)]
+    #[arg(long, help_heading = "Vehicle")]
     pub airframe: bool,
+    /// Change a parameter of the autopilot at boot; may be repeated
+    #[arg(long = "param", help_heading = "Vehicle", value_name = "NAME=VALUE", value_parser = parse_param)]
+    pub params: Vec<(String, f32)>,
     /// Start-up times of a real autopilot
     ///
     /// Alignment takes 2 s and external navigation 1 s. Otherwise, the vehicle was powered before the start, and its
     /// position is valid after 0.2 s.
-    #[arg(long)]
+    #[arg(long, help_heading = "Vehicle")]
     pub realistic_startup: bool,
-    /// Change a parameter of the autopilot at boot; may be repeated
-    #[arg(long = "param", value_name = "NAME=VALUE", value_parser = parse_param)]
-    pub params: Vec<(String, f32)>,
-    /// Steady wind, world axes [m/s]
-    #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = parse_numbers::<3>, allow_hyphen_values = true)]
-    pub wind: [f64; 3],
-    /// Standard deviation of gusts along each horizontal axis [m/s]
-    #[arg(long, value_name = "M/S", default_value_t = 0.0)]
-    pub gusts: f64,
     /// Inertial sensor of the autopilot
-    #[arg(long, value_name = "NAME", default_value_t, help = format!(
+    #[arg(long, help_heading = "Vehicle", value_name = "NAME", default_value_t, help = format!(
+        "Inertial sensor: {}", ImuModel::names()
+    ), long_help = format!(
         "Inertial sensor (frame: noise by a small frame; chips: by data sheet): {}",
         ImuModel::names()
     ))]
@@ -107,62 +76,119 @@ pub struct SimArgs {
     /// Vibration by each unbalanced rotor at full throttle [m/s^2]
     ///
     /// With 200, a hovering vehicle reports about 30, at which ArduPilot warns.
-    #[arg(long, value_name = "M/S^2", default_value_t = 0.0)]
+    #[arg(long, help_heading = "Vehicle", value_name = "M/S^2", default_value_t = 0.0)]
     pub vibration: f64,
     /// Charge of the battery at the start [%]
-    #[arg(long, value_name = "PERCENT", default_value_t = 100.0)]
+    #[arg(long, help_heading = "Vehicle", value_name = "PERCENT", default_value_t = 100.0)]
     pub battery: f64,
     /// Simulate a connected radio control with its transmitter on
-    #[arg(long)]
+    #[arg(long, help_heading = "Vehicle")]
     pub radio: bool,
-    /// The transmitter falls silent this long after take-off [s]
-    #[arg(long, value_name = "SECONDS", requires = "radio")]
-    pub radio_lost_after: Option<f64>,
-    /// A motor (1 to 4, ArduCopter's order) fails this long after take-off [s]
+    /// Motor (1 to 4, ArduCopter's order) that fails, and time after take-off [s]
     ///
     /// It then gives PERCENT of its thrust, or nothing if PERCENT is absent.
-    #[arg(long, value_name = "MOTOR@SECONDS[,PERCENT]", value_parser = parse_motor_fault)]
+    #[arg(long, help_heading = "Faults", value_name = "MOTOR@SECONDS[,PERCENT]", value_parser = parse_motor_fault)]
     pub motor_failure: Option<MotorFault>,
-    /// The autopilot reboots this long after take-off; motors stop at once [s]
-    #[arg(long, value_name = "SECONDS")]
+    /// Time after take-off at which the transmitter falls silent [s]
+    #[arg(long, help_heading = "Faults", value_name = "SECONDS", requires = "radio")]
+    pub radio_lost_after: Option<f64>,
+    /// Time after take-off at which the autopilot reboots; motors stop at once [s]
+    #[arg(long, help_heading = "Faults", value_name = "SECONDS")]
     pub reboot_after: Option<f64>,
+    /// Destination of Vicon's UDP object stream; none if absent
+    #[arg(long, help_heading = "Localization", value_name = "HOST:PORT", value_parser = parse_address)]
+    pub vicon: Option<SocketAddr>,
+    /// Destination of another motion capture format; may be repeated
+    ///
+    /// Formats: vicon, json or mavlink with a destination; natnet with the address where Motive waits for listeners, or
+    /// with a multicast group.
+    #[arg(long, help_heading = "Localization", value_name = "FORMAT:HOST:PORT")]
+    pub mocap: Vec<FeedTarget>,
+    /// Name of the vehicle in the motion capture
+    #[arg(long, help_heading = "Localization", value_name = "NAME", default_value = "vizflyt", value_parser = parse_object)]
+    pub object: String,
+    /// Destination of the true pose at every tick; may be repeated
+    ///
+    /// Sends the JSON that `vizflyt serve` reads poses from, with the instant on CLOCK_MONOTONIC. `vizflyt tags locate`
+    /// renders the images of its simulated cameras from it.
+    #[arg(long, help_heading = "Localization", value_name = "HOST:PORT", value_parser = parse_address)]
+    pub truth_to: Vec<SocketAddr>,
+    /// Additional latency of the motion capture [ms]
+    #[arg(long, help_heading = "Localization", value_name = "MS", default_value_t = 0.0)]
+    pub mocap_delay_ms: f64,
+    /// Share of lost datagrams of the motion capture [%]
+    #[arg(long, help_heading = "Localization", value_name = "PERCENT", default_value_t = 0.0)]
+    pub mocap_drop_percent: f64,
+    /// Time after which the motion capture falls silent [s]
+    #[arg(long, help_heading = "Localization", value_name = "SECONDS")]
+    pub mocap_stop_after: Option<f64>,
+    /// Endpoint of MAVLink; up to four, like telemetry ports of one autopilot
+    ///
+    /// udpout:HOST:PORT sends first, udpin:HOST:PORT and tcpin:HOST:PORT wait, tcpout:HOST:PORT connects;
+    /// serial:PATH[:BAUD] and pty:PATH[:BAUD] are like --serial and --pty. Default: udpout:127.0.0.1:14550, unless
+    /// --serial or --pty is given.
+    #[arg(long, help_heading = "MAVLink", value_name = "ENDPOINT")]
+    pub mavlink: Vec<Endpoint>,
+    /// Serial device, or existing pseudo-terminal, for MAVLink
+    ///
+    /// Waits until the device exists.
+    #[arg(long, help_heading = "MAVLink", value_name = "PATH")]
+    pub serial: Option<PathBuf>,
+    /// Create a pseudo-terminal for MAVLink, and a link to it with this name
+    #[arg(long, help_heading = "MAVLink", value_name = "PATH", conflicts_with = "serial")]
+    pub pty: Option<PathBuf>,
+    /// Baud rate of --serial and --pty; limits the speed of sending
+    #[arg(long, help_heading = "MAVLink", value_name = "BAUD", default_value_t = DEFAULT_BAUD, value_parser = parse_baud)]
+    pub baud: u32,
     /// Send MAVLink through a model of an ESP8266's Wi-Fi
     ///
     /// Batches of 2 to 5 ms, latency, and bursts of loss.
-    #[arg(long)]
+    #[arg(long, help_heading = "Wi-Fi")]
     pub wifi: bool,
     /// Latency of --wifi [ms]
-    #[arg(long, value_name = "MS", default_value_t = 2.0, requires = "wifi")]
+    #[arg(
+        long,
+        help_heading = "Wi-Fi",
+        value_name = "MS",
+        default_value_t = 2.0,
+        requires = "wifi"
+    )]
     pub wifi_latency_ms: f64,
     /// Mean additional latency by contention with --wifi [ms]
-    #[arg(long, value_name = "MS", default_value_t = 1.0, requires = "wifi")]
+    #[arg(
+        long,
+        help_heading = "Wi-Fi",
+        value_name = "MS",
+        default_value_t = 1.0,
+        requires = "wifi"
+    )]
     pub wifi_jitter_ms: f64,
     /// Share of lost batches with --wifi [%]
-    #[arg(long, value_name = "PERCENT", default_value_t = 1.0, requires = "wifi")]
+    #[arg(
+        long,
+        help_heading = "Wi-Fi",
+        value_name = "PERCENT",
+        default_value_t = 1.0,
+        requires = "wifi"
+    )]
     pub wifi_loss_percent: f64,
     /// Mean number of batches lost in a row with --wifi
-    #[arg(long, value_name = "BATCHES", default_value_t = 3.0, requires = "wifi")]
+    #[arg(
+        long,
+        help_heading = "Wi-Fi",
+        value_name = "BATCHES",
+        default_value_t = 3.0,
+        requires = "wifi"
+    )]
     pub wifi_burst: f64,
+    /// Seed of all noise
+    #[arg(long, help_heading = "Simulation", default_value_t = 0)]
+    pub seed: u64,
     /// Simulated seconds per second
-    #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
+    #[arg(long, help_heading = "Simulation", value_name = "FACTOR", default_value_t = 1.0)]
     pub realtime_factor: f64,
-    /// The motion capture falls silent after this time [s]
-    #[arg(long, value_name = "SECONDS")]
-    pub mocap_stop_after: Option<f64>,
-    /// Additional latency of the motion capture [ms]
-    #[arg(long, value_name = "MS", default_value_t = 0.0)]
-    pub mocap_delay_ms: f64,
-    /// Share of lost datagrams of the motion capture [%]
-    #[arg(long, value_name = "PERCENT", default_value_t = 0.0)]
-    pub mocap_drop_percent: f64,
-    /// Move the vehicle by hand instead of flying
-    ///
-    /// Repeats: lift, push forward, turn left, raise the nose, raise the left side. The IMU measures these motions.
-    /// `vizflyt doctor localization` needs them.
-    #[arg(long)]
-    pub hand: bool,
     /// Print JSON lines on stdout: one when ready, one report at the end
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     pub json: bool,
     /// End when stdin ends
     #[arg(long, hide = true)]

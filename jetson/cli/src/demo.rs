@@ -24,21 +24,21 @@ use crate::plugins;
   vizflyt demo --localization mat               no motion capture: a webcam under the vehicle sees tags on the floor
   vizflyt demo --plugin ./my_plugin             your plugin instead of the example")]
 pub(crate) struct DemoArgs {
-    #[command(flatten)]
-    lab: LabArgs,
     /// Plugin to fly, as for `vizflyt fly`
     ///
     /// [default: race if the course ends at its last stage, else avoid]
-    #[arg(long)]
+    #[arg(long, help_heading = "Flight")]
     plugin: Option<String>,
     /// Maximum flight time; then the vehicle lands [s] [default: limit of the course]
-    #[arg(long)]
+    #[arg(long, help_heading = "Flight")]
     seconds: Option<f64>,
     /// Take off when `start` is pressed on the page, not automatically
-    #[arg(long)]
+    #[arg(long, help_heading = "Flight")]
     wait: bool,
+    #[command(flatten)]
+    lab: LabArgs,
     /// File for the results of the flight, as JSON
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Output", value_name = "FILE")]
     report: Option<PathBuf>,
     #[command(flatten)]
     log: LogArgs,

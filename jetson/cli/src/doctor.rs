@@ -58,30 +58,36 @@ struct VehicleArgs {
     #[command(flatten)]
     autopilot: AutopilotArgs,
     /// File of correct parameters [default: hardware/airframe's, by autopilot version]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Parameters", value_name = "FILE")]
     airframe: Option<PathBuf>,
     /// arena.toml for the autopilot's fence: its room, relative to its spawn
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["ceiling", "radius"])]
+    #[arg(long, help_heading = "Parameters", value_name = "FILE", conflicts_with_all = ["ceiling", "radius"])]
     arena: Option<PathBuf>,
     /// Maximum height of the autopilot's fence [m]
-    #[arg(long, value_name = "METRES", value_parser = metres)]
+    #[arg(long, help_heading = "Parameters", value_name = "METRES", value_parser = metres)]
     ceiling: Option<f64>,
     /// Radius of the autopilot's fence around the take-off point [m]
-    #[arg(long, value_name = "METRES", value_parser = metres)]
+    #[arg(long, help_heading = "Parameters", value_name = "METRES", value_parser = metres)]
     radius: Option<f64>,
     /// Write the correct values, after printing them
-    #[arg(long)]
+    #[arg(long, help_heading = "Parameters")]
     apply: bool,
     /// Page of a server that records the result in its lab day: http://HOST:PORT
-    #[arg(long, value_name = "URL", conflicts_with = "apply")]
+    #[arg(long, help_heading = "Lab day", value_name = "URL", conflicts_with = "apply")]
     report: Option<String>,
     /// Name of the vehicle on that server
-    #[arg(long, value_name = "NAME", default_value = "vizflyt", requires = "report")]
+    #[arg(
+        long,
+        help_heading = "Lab day",
+        value_name = "NAME",
+        default_value = "vizflyt",
+        requires = "report"
+    )]
     vehicle: String,
     /// Instructor's key of that page; not needed on the server's own computer
     ///
     /// The key is in the address /enter?key=KEY.
-    #[arg(long, value_name = "KEY", requires = "report")]
+    #[arg(long, help_heading = "Lab day", value_name = "KEY", requires = "report")]
     key: Option<String>,
 }
 

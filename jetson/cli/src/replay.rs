@@ -35,38 +35,44 @@ pub(crate) struct ReplayArgs {
     #[arg(value_name = "FLIGHT.mcap")]
     log: PathBuf,
     /// Plugin, as for `vizflyt fly` [default: the plugin of the flight]
-    #[arg(long, value_name = "PLUGIN")]
+    #[arg(long, help_heading = "Plugin", value_name = "PLUGIN")]
     plugin: Option<OsString>,
     /// Arguments for the plugin, after `--`
     #[arg(last = true, value_name = "ARGUMENT", requires = "plugin")]
     plugin_arguments: Vec<OsString>,
     /// Map file of the flight (map.json), if its plugin received one
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Plugin", value_name = "FILE")]
     map: Option<PathBuf>,
+    /// Also feed the images that the plugin skipped in flight because it was busy
+    #[arg(long, help_heading = "Images")]
+    all: bool,
+    /// Replay at the pace of the flight, instead of as fast as the plugin answers
+    #[arg(long, help_heading = "Images")]
+    realtime: bool,
+    /// Timeout of an answer; then the replay ends
+    #[arg(long, help_heading = "Images", value_name = "SECONDS", default_value_t = 30.0)]
+    within: f64,
     /// Send only the flight's poses to this address, at the pace of the flight
     ///
     /// The packets have the format of `vizflyt serve --pose json`.
-    #[arg(long, value_name = "HOST:PORT", conflicts_with_all = ["plugin", "map", "all", "answers", "report"])]
+    #[arg(long, help_heading = "Localization", value_name = "HOST:PORT", conflicts_with_all = ["plugin", "map", "all", "answers", "report"])]
     poses_to: Option<SocketAddr>,
     /// Name of the vehicle in those packets
-    #[arg(long, value_name = "NAME", default_value = "vizflyt", requires = "poses_to")]
+    #[arg(
+        long,
+        help_heading = "Localization",
+        value_name = "NAME",
+        default_value = "vizflyt",
+        requires = "poses_to"
+    )]
     object: String,
-    /// Replay at the pace of the flight, instead of as fast as the plugin answers
-    #[arg(long)]
-    realtime: bool,
-    /// Also feed the images that the plugin skipped in flight because it was busy
-    #[arg(long)]
-    all: bool,
-    /// Timeout of an answer; then the replay ends
-    #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
-    within: f64,
     /// File for all answers, one JSON object per line
     ///
     /// [default: next to the log, ending in .answers.jsonl]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Output", value_name = "FILE")]
     answers: Option<PathBuf>,
     /// File for the results, as JSON
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Output", value_name = "FILE")]
     report: Option<PathBuf>,
 }
 

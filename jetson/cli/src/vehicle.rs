@@ -20,12 +20,12 @@ pub(crate) struct AutopilotArgs {
     /// Address: udpin:ADDR:PORT, udpout:, tcpin:, tcpout:HOST:PORT or serial:PATH:BAUD
     ///
     /// [default: [vehicle] of jetson.toml, or udpin:0.0.0.0:14550]
-    #[arg(long, value_name = "ADDRESS")]
+    #[arg(long, help_heading = "Vehicle", value_name = "ADDRESS")]
     mavlink: Option<MavlinkAddress>,
     /// Settings file of this computer
     ///
     /// [default: ./jetson.toml, ~/.config/vizflyt/jetson.toml or /etc/vizflyt/jetson.toml]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Vehicle", value_name = "FILE")]
     config: Option<PathBuf>,
 }
 
@@ -105,10 +105,10 @@ struct SignArgs {
     #[command(flatten)]
     autopilot: AutopilotArgs,
     /// Key file; created if it does not exist, otherwise sent again
-    #[arg(long, value_name = "FILE", required_unless_present = "off")]
+    #[arg(long, help_heading = "Signing", value_name = "FILE", required_unless_present = "off")]
     key: Option<PathBuf>,
     /// Turn signing off: the autopilot accepts unsigned packets again
-    #[arg(long, conflicts_with = "key")]
+    #[arg(long, help_heading = "Signing", conflicts_with = "key")]
     off: bool,
 }
 

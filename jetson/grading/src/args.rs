@@ -47,68 +47,82 @@ pub(super) struct FlyArgs {
     /// Plugin, as for `vizflyt fly`
     #[arg(value_name = "PLUGIN", required = true)]
     pub(super) plugin: Option<OsString>,
-    #[arg(long, value_name = "NAME|FILE", default_value = "p4", help = format!(
-        "Course project: {}; or a file FILE.toml", projects::NAMES.join(", ")
+    #[arg(long, help_heading = "Scene", value_name = "NAME|FILE", default_value = "p4", help = format!(
+        "Project: {}; or FILE.toml", projects::NAMES.join(", ")
     ))]
     pub(super) project: String,
     /// Sensors: ug with depth, g without depth
-    #[arg(long, value_name = "ug|g", default_value_t)]
+    #[arg(long, help_heading = "Scene", value_name = "ug|g", default_value_t)]
     pub(super) level: Level,
-    #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "day", help = format!(
+    /// Light and weather for each seed; random:20 draws 20 combinations
+    #[arg(long, help_heading = "Scene", value_name = "LIST", value_delimiter = ',', default_value = "day", long_help = format!(
         "Light and weather for each seed: {}; or random:20, which draws 20 from the first \
          seed within the project's bounds", Variant::names()
     ))]
     pub(super) variants: Vec<VariantChoice>,
+    /// Timeout of an answer, in time of the plugin's own; a timeout is a failure
+    #[arg(long, help_heading = "Plugin", value_name = "SECONDS", default_value_t = 10.0)]
+    pub(super) answer_within: f64,
+    /// Path to hide from the plugin, like keys, seed and report; can be repeated
+    #[arg(long, help_heading = "Plugin", value_name = "PATH")]
+    pub(super) hide: Vec<PathBuf>,
+    /// Grade again when the plugin is saved, and print what changed
+    #[arg(long, help_heading = "Plugin", conflicts_with_all = ["resume", "shard", "json", "junit", "least"])]
+    pub(super) watch: bool,
     /// Number of seeds; each seed gives another course
-    #[arg(long, value_name = "N", default_value_t = 10)]
+    #[arg(long, help_heading = "Flight", value_name = "N", default_value_t = 10)]
     pub(super) seeds: u64,
     /// First seed, or a file that contains it
     ///
     /// Keep it secret, so that teams cannot prepare for the courses.
-    #[arg(long, value_name = "SEED|@FILE", default_value = "1")]
+    #[arg(long, help_heading = "Flight", value_name = "SEED|@FILE", default_value = "1")]
     pub(super) first_seed: FirstSeed,
     /// Fly only shard I of N; combine all shards with `grade merge`
-    #[arg(long, value_name = "I/N")]
+    #[arg(long, help_heading = "Flight", value_name = "I/N")]
     pub(super) shard: Option<Shard>,
     /// Number of flights at a time [default: number of processors]
-    #[arg(long, value_name = "N")]
+    #[arg(long, help_heading = "Flight", value_name = "N")]
     pub(super) jobs: Option<NonZero<usize>>,
-    /// Image rate of cameras without their own rate [Hz]
-    #[arg(long, value_name = "HZ", default_value_t = 30.0)]
-    pub(super) image_rate: f64,
-    /// Delay from the pose until the image is delivered to the plugin
-    #[arg(long, value_name = "MS", default_value_t = 30.0)]
-    pub(super) image_delay: f64,
-    /// Delay from delivery of the image until the plugin's answer takes effect
-    #[arg(long, value_name = "MS", default_value_t = 10.0)]
-    pub(super) answer_delay: f64,
-    /// Simulated inertial sensor
-    #[arg(long, value_name = "NAME", default_value_t, help = format!(
+    #[arg(long, help_heading = "Vehicle", value_name = "NAME", default_value_t, help = format!(
+        "Inertial sensor: {}", ImuModel::names()
+    ), long_help = format!(
         "Simulated inertial sensor, with the noise of its data sheet; frame: with the vibration of a small frame: {}",
         ImuModel::names()
     ))]
     pub(super) imu: ImuModel,
-    /// Timeout of an answer, in time of the plugin's own; a timeout is a failure
-    #[arg(long, value_name = "SECONDS", default_value_t = 10.0)]
-    pub(super) answer_within: f64,
+    /// Image rate of cameras without their own rate [Hz]
+    #[arg(long, help_heading = "Vehicle", value_name = "HZ", default_value_t = 30.0)]
+    pub(super) image_rate: f64,
+    /// Delay from the pose until the image is delivered to the plugin
+    #[arg(long, help_heading = "Vehicle", value_name = "MS", default_value_t = 30.0)]
+    pub(super) image_delay: f64,
+    /// Delay from delivery of the image until the plugin's answer takes effect
+    #[arg(long, help_heading = "Vehicle", value_name = "MS", default_value_t = 10.0)]
+    pub(super) answer_delay: f64,
     /// Folder for a report: index.html with images, flight logs, signed grade.json
     ///
     /// index.html has a card for each flight. The folder also gets junit.xml. grade.json signs all
     /// files.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, help_heading = "Output", value_name = "DIR")]
     pub(super) report: Option<PathBuf>,
     /// Keep the finished flights of an interrupted grade, and fly the others
-    #[arg(long, requires = "report")]
+    #[arg(long, help_heading = "Output", requires = "report")]
     pub(super) resume: bool,
-    /// Grade again when the plugin is saved, and print what changed
-    #[arg(long, conflicts_with_all = ["resume", "shard", "json", "junit", "least"])]
-    pub(super) watch: bool,
     /// Compare with this grade or report [default: the report that --report replaces]
-    #[arg(long, value_name = "FILE|DIR")]
+    #[arg(long, help_heading = "Output", value_name = "FILE|DIR")]
     pub(super) since: Option<PathBuf>,
+    /// File for results as JUnit XML
+    #[arg(long, help_heading = "Output", value_name = "FILE")]
+    pub(super) junit: Option<PathBuf>,
+    /// Minimum mean score (0 to 100); below it, the exit status is 1
+    #[arg(long, help_heading = "Output", value_name = "SCORE")]
+    pub(super) least: Option<f64>,
+    #[command(flatten)]
+    pub(super) result: ResultArgs,
     /// Images in the report's flight logs: up to 60 MB per minute, all, or no log
     #[arg(
         long,
+        help_heading = "Log",
         value_name = "reduced|full|none",
         value_enum,
         default_value_t,
@@ -116,19 +130,8 @@ pub(super) struct FlyArgs {
     )]
     pub(super) log: LogOption,
     /// Also log depth in a format that all viewers show (16UC1)
-    #[arg(long, requires = "report")]
+    #[arg(long, help_heading = "Log", requires = "report")]
     pub(super) log_depth: bool,
-    /// Path to hide from the plugin, besides keys, seed and report; can be repeated
-    #[arg(long, value_name = "PATH")]
-    pub(super) hide: Vec<PathBuf>,
-    /// File for results as JUnit XML
-    #[arg(long, value_name = "FILE")]
-    pub(super) junit: Option<PathBuf>,
-    /// Minimum mean score (0 to 100); below it, the exit status is 1
-    #[arg(long, value_name = "SCORE")]
-    pub(super) least: Option<f64>,
-    #[command(flatten)]
-    pub(super) result: ResultArgs,
 }
 
 /// First seed, from the command line or a file. A file keeps it out of the process list and the
@@ -160,13 +163,13 @@ impl FromStr for FirstSeed {
 #[derive(Args, Clone, Debug)]
 pub(super) struct ResultArgs {
     /// Print the signed grade as JSON instead of text
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     pub(super) json: bool,
     /// File for the signed grade, as JSON
-    #[arg(long, short, value_name = "FILE")]
+    #[arg(long, short, help_heading = "Output", value_name = "FILE")]
     pub(super) output: Option<PathBuf>,
     /// Folder of the key that signs grades [default: ~/.config/vizflyt]
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, help_heading = "Output", value_name = "DIR")]
     pub(super) keys: Option<PathBuf>,
 }
 
@@ -200,7 +203,7 @@ pub(super) enum GradeCommand {
         /// Folder for a report of the combined grade: index.html, grade.json
         ///
         /// Images stay in the reports of the shards.
-        #[arg(long, value_name = "DIR")]
+        #[arg(long, help_heading = "Output", value_name = "DIR")]
         report: Option<PathBuf>,
         #[command(flatten)]
         result: ResultArgs,

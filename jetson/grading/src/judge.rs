@@ -33,24 +33,24 @@ pub(super) struct JudgeArgs {
     /// Arena of the flight: scene folder, arena.toml, scene file or generated scene
     ///
     /// [default: forest]
-    #[arg(long, value_name = "SCENE")]
+    #[arg(long, help_heading = "Scene", value_name = "SCENE")]
     scene: Option<String>,
     /// Course project of the flight; replaces --scene
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, help_heading = "Scene", value_name = "NAME")]
     project: Option<String>,
     /// Level of the project
-    #[arg(long, value_name = "ug|g", requires = "project")]
+    #[arg(long, help_heading = "Scene", value_name = "ug|g", requires = "project")]
     level: Option<Level>,
     /// Light and weather of the project
-    #[arg(long, value_name = "NAME", requires = "project")]
+    #[arg(long, help_heading = "Scene", value_name = "NAME", requires = "project")]
     variant: Option<Variant>,
     /// Seed of a generated scene or course
-    #[arg(long)]
+    #[arg(long, help_heading = "Scene")]
     seed: Option<u64>,
     #[command(flatten)]
     bare: BareArgs,
     /// Print the verdict as JSON
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     json: bool,
 }
 

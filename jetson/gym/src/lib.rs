@@ -37,42 +37,56 @@ const TICKS_HZ: u32 = 400;
 /// Fly courses for a learning program; Python's `vizflyt.Env` starts it
 #[derive(Args, Debug)]
 pub struct GymArgs {
-    /// The course: a project's name or file
-    #[arg(long, value_name = "NAME", help = format!("The course's project: {}, or FILE.toml", NAMES.join(", ")))]
+    #[arg(long, help_heading = "Scene", value_name = "NAME", help = format!(
+        "Project: {}; or FILE.toml", NAMES.join(", ")
+    ))]
     project: String,
     /// Courses to fly, by their seeds
-    #[arg(long, value_delimiter = ',', value_name = "SEED,...", default_value = "1")]
+    #[arg(
+        long,
+        help_heading = "Scene",
+        value_delimiter = ',',
+        value_name = "SEED,...",
+        default_value = "1"
+    )]
     courses: Vec<u64>,
+    /// Light and weather
+    #[arg(long, help_heading = "Scene", value_name = "NAME", default_value = "day")]
+    variant: Variant,
     /// Number of vehicles, each in a separate episode
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=4096))]
+    #[arg(long, help_heading = "Flight", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=4096))]
     envs: u32,
     /// Quantity that an action commands
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, help_heading = "Flight", value_enum, default_value_t)]
     action: Action,
     /// Steps per second
-    #[arg(long, value_name = "HZ", default_value_t = 40, value_parser = clap::value_parser!(u32).range(10..=400))]
+    #[arg(long, help_heading = "Flight", value_name = "HZ", default_value_t = 40, value_parser = clap::value_parser!(u32).range(10..=400))]
     rate: u32,
     /// Steps until an action takes effect
-    #[arg(long, value_name = "STEPS", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=40))]
+    #[arg(long, help_heading = "Flight", value_name = "STEPS", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=40))]
     delay: u32,
     /// Maximum time of an episode
-    #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
+    #[arg(long, help_heading = "Flight", value_name = "SECONDS", default_value_t = 30.0)]
     seconds: f64,
     /// Image size; images are of the first camera of the course
-    #[arg(long, value_name = "WxH")]
+    #[arg(long, help_heading = "Rendering", value_name = "WxH")]
     camera: Option<ImageSize>,
     /// Horizontal field of view (default: that of the course's camera)
-    #[arg(long, value_name = "DEGREES", requires = "camera")]
+    #[arg(long, help_heading = "Rendering", value_name = "DEGREES", requires = "camera")]
     fov: Option<f64>,
-    /// Maximum position error of rendered splats; 0 renders every splat exactly
-    #[arg(long, value_name = "PX", default_value_t = 0.7, value_parser = error_px)]
-    error_px: f32,
     /// Layers of the images
-    #[arg(long, value_enum, value_delimiter = ',', default_value = "depth", requires = "camera")]
+    #[arg(
+        long,
+        help_heading = "Rendering",
+        value_enum,
+        value_delimiter = ',',
+        default_value = "depth",
+        requires = "camera"
+    )]
     layers: Vec<Layer>,
-    /// Light and weather
-    #[arg(long, value_name = "NAME", default_value = "day")]
-    variant: Variant,
+    /// Maximum position error of rendered splats; 0 renders every splat exactly
+    #[arg(long, help_heading = "Rendering", value_name = "PX", default_value_t = 0.7, value_parser = error_px)]
+    error_px: f32,
 }
 
 fn error_px(text: &str) -> Result<f32, String> {

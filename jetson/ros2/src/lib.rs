@@ -75,7 +75,7 @@ pub struct Ros2Args {
     /// End after the first flight
     #[arg(long)]
     once: bool,
-    /// Attaches only to this runtime.
+    /// Attach only to this runtime
     #[arg(long = "vizflyt-service", value_name = "X", hide = true)]
     service: Option<String>,
 }

@@ -16,7 +16,7 @@ use crate::link::{LinkSettings, SigningFile, VISION_HZ};
 use crate::log::{LogSettings, LoggedImages};
 use vizflyt_guardian::port::MavlinkAddress;
 
-/// Flies a plugin with images from the render server
+/// Fly a plugin with images from the render server
 ///
 /// The guard checks the plugin's setpoints and sends them to the autopilot.
 #[derive(Args, Clone, Debug)]
@@ -30,15 +30,27 @@ pub struct FlyArgs {
     /// Plugin, started as a child process [default: `path` of [plugin] in jetson.toml]
     #[arg(value_name = "PLUGIN")]
     pub plugin: Option<OsString>,
-    /// Waits for a plugin that you start yourself, instead of starting one
-    ///
-    /// For example `python my_plugin.py`, a debugger or a notebook. There is no timeout. At a breakpoint the vehicle
-    /// holds.
-    #[arg(long, conflicts_with_all = ["plugin", "plugin_arguments"])]
-    pub attach: bool,
     /// Arguments for the plugin, after `--`
     #[arg(last = true, value_name = "ARGUMENT")]
     pub plugin_arguments: Vec<OsString>,
+    /// Wait for a plugin that you start yourself, instead of starting one
+    ///
+    /// For example `python my_plugin.py`, a debugger or a notebook. There is no timeout. At a breakpoint the vehicle
+    /// holds.
+    #[arg(long, help_heading = "Plugin", conflicts_with_all = ["plugin", "plugin_arguments"])]
+    pub attach: bool,
+    /// Map file for the plugin (map.json), for courses with a known map
+    #[arg(long, help_heading = "Plugin", value_name = "FILE")]
+    pub map: Option<PathBuf>,
+    /// Time from take-off until the vehicle lands; 0: time limit of the arena
+    #[arg(long, help_heading = "Flight", value_name = "SECONDS", default_value_t = 0.0)]
+    pub seconds: f64,
+    /// Maximum time until the vehicle is in the air; 0: no timeout
+    #[arg(long, help_heading = "Flight", value_name = "SECONDS", default_value_t = 120.0)]
+    pub ready_within: f64,
+    /// Wait on the ground until `start` is pressed on the server's page
+    #[arg(long, help_heading = "Flight")]
+    pub wait: bool,
     /// Render server and keys
     #[command(flatten)]
     pub server: ServerArgs,
@@ -46,53 +58,41 @@ pub struct FlyArgs {
     ///
     /// `udpin:ADDR:PORT` waits for packets, `udpout:HOST:PORT` sends first; also `tcpin:`, `tcpout:` and
     /// `serial:/dev/ttyTHS1:921600`, with `:rtscts` at the end for flow control.
-    #[arg(long, value_name = "ADDRESS")]
+    #[arg(long, help_heading = "Real lab", value_name = "ADDRESS")]
     pub mavlink: Option<MavlinkAddress>,
     /// Name of the vehicle in the localization system [default: vizflyt]
-    #[arg(long)]
+    #[arg(long, help_heading = "Real lab")]
     pub vehicle: Option<String>,
-    /// Map file for the plugin (map.json), for courses with a known map
-    #[arg(long, value_name = "FILE")]
-    pub map: Option<PathBuf>,
+    /// File for the results of the flight, as JSON
+    #[arg(long, help_heading = "Output", value_name = "FILE")]
+    pub report: Option<PathBuf>,
+    /// Print one JSON object per line for programs, instead of text
+    #[arg(long, help_heading = "Output")]
+    pub json: bool,
     /// Flight log
     #[command(flatten)]
     pub log: LogArgs,
-    /// Streams the log's channels live to Foxglove
+    /// Stream the log's channels live to Foxglove
     ///
     /// Listens on ADDR:PORT, by default on port 8765 of this computer only. Every viewer that can reach the port sees
     /// the flight.
-    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, require_equals = true,
+    #[arg(long, help_heading = "Log", value_name = "ADDR:PORT", num_args = 0..=1, require_equals = true,
           default_missing_value = "127.0.0.1:8765")]
     pub foxglove: Option<SocketAddr>,
-    /// Writes the report to this file (JSON)
-    #[arg(long, value_name = "FILE")]
-    pub report: Option<PathBuf>,
-    /// Time from take-off until the vehicle lands; 0: time limit of the arena
-    #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
-    pub seconds: f64,
-    /// Maximum time until the vehicle is in the air; 0: no timeout
-    #[arg(long, value_name = "SECONDS", default_value_t = 120.0)]
-    pub ready_within: f64,
-    /// Waits on the ground until `start` is pressed on the server's page
-    #[arg(long)]
-    pub wait: bool,
-    /// Limits of this vehicle, from `jetson.toml`
-    #[arg(skip = Limits::NONE)]
-    pub limits: Limits,
-    /// Prints one JSON object per line for programs, instead of text
-    #[arg(long)]
-    pub json: bool,
-    /// Ends when standard input closes, so that it never outlives its parent
-    #[arg(long, hide = true)]
-    pub lifeline: bool,
     /// Settings file of this computer
     ///
     /// [default: ./jetson.toml, ~/.config/vizflyt/jetson.toml or /etc/vizflyt/jetson.toml]
     #[arg(long, value_name = "FILE", conflicts_with = "no_config")]
     pub config: Option<PathBuf>,
-    /// Reads no jetson.toml
+    /// Ignore jetson.toml
     #[arg(long)]
     pub no_config: bool,
+    /// End when standard input closes
+    #[arg(long, hide = true)]
+    pub lifeline: bool,
+    /// Limits of this vehicle, from `jetson.toml`
+    #[arg(skip = Limits::NONE)]
+    pub limits: Limits,
     /// Settings from `jetson.toml`; [`FlyArgs::settle`] reads them.
     #[arg(skip)]
     pub jetson: JetsonConfig,
@@ -170,15 +170,20 @@ pub struct LogArgs {
     ///
     /// `reduced` stores as many images as fit into 60 MB a minute, `full` stores all images, for a bit-exact replay.
     /// [default: `images` of [log] in jetson.toml, else reduced]
-    #[arg(long = "log", value_name = "reduced|full|none", hide_possible_values = true)]
+    #[arg(
+        long = "log",
+        help_heading = "Log",
+        value_name = "reduced|full|none",
+        hide_possible_values = true
+    )]
     pub option: Option<LogOption>,
     /// Folder for flight logs (MCAP) [default: flights]
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, help_heading = "Log", value_name = "DIR")]
     pub log_dir: Option<PathBuf>,
-    /// Writes depth a second time as 16UC1, which every viewer shows
+    /// Also log depth as 16UC1, which all viewers show
     ///
     /// This adds 150 kB per image of 320x240.
-    #[arg(long)]
+    #[arg(long, help_heading = "Log")]
     pub log_depth: bool,
 }
 
@@ -258,15 +263,15 @@ pub fn link_settings(vehicle: &VehicleConfig, name: &str) -> anyhow::Result<Link
 #[derive(Args, Clone, Debug)]
 pub struct ServerArgs {
     /// Address of the render server, once paired with `vizflyt pair HOST:PORT`
-    #[arg(long = "server", value_name = "HOST:PORT")]
+    #[arg(long = "server", help_heading = "Real lab", value_name = "HOST:PORT")]
     pub at: Option<ServerAddress>,
     /// SHA-256 of the server's certificate [default: from pairing]
-    #[arg(long, value_name = "HEX")]
+    #[arg(long, help_heading = "Real lab", value_name = "HEX")]
     pub fingerprint: Option<Fingerprint>,
     /// Folder of this computer's key and of servers.toml
     ///
     /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, help_heading = "Real lab", value_name = "DIR")]
     pub keys: Option<PathBuf>,
 }
 

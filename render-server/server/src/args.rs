@@ -38,97 +38,97 @@ pub struct ServeArgs {
     /// Folder of scenes from which the instructor chooses on the page
     ///
     /// Each scene is a folder with an arena.toml.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, help_heading = "Scene", value_name = "DIR")]
     pub scenes: Option<PathBuf>,
 
     /// Address for runtimes (UDP)
-    #[arg(long, value_name = "ADDR", default_value = "0.0.0.0:4433")]
+    #[arg(long, help_heading = "Network", value_name = "ADDR", default_value = "0.0.0.0:4433")]
     pub quic: SocketAddr,
 
     /// Address of the page; port 0 selects a free one
-    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080")]
+    #[arg(long, help_heading = "Web page", value_name = "ADDR", default_value = "127.0.0.1:8080")]
     pub http: SocketAddr,
 
     /// HTTPS for the page: `auto`, or a certificate's PEM file [default: plain HTTP]
     ///
     /// `auto` creates a certificate and stores it with the server's keys. A file also needs --tls-key.
-    #[arg(long, value_name = "auto|CERT", value_hint = ValueHint::FilePath)]
+    #[arg(long, help_heading = "Web page", value_name = "auto|CERT", value_hint = ValueHint::FilePath)]
     pub tls: Option<PathBuf>,
 
     /// PEM file of the private key of --tls CERT
-    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    #[arg(long, help_heading = "Web page", value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub tls_key: Option<PathBuf>,
 
     /// Serve the page over plain HTTP on a public address too
     ///
     /// Everyone on the network path can then read keys and images.
-    #[arg(long)]
+    #[arg(long, help_heading = "Web page")]
     pub plain_http: bool,
 
     /// Address for Vicon Tracker's UDP object stream [default: 0.0.0.0:51001]
     ///
     /// The default applies unless arena.toml has [[localization]] or --pose is given.
-    #[arg(long, value_name = "ADDR")]
+    #[arg(long, help_heading = "Localization", value_name = "ADDR")]
     pub vicon: Option<SocketAddr>,
 
-    /// Pose sources instead of those of `arena.toml`
-    #[arg(long, value_name = "DRIVER:ADDR[,KEY=VALUE]", help = pose_help(), value_parser = LocalizationConfig::parse)]
+    /// Pose source instead of those of arena.toml; may be repeated
+    #[arg(long, help_heading = "Localization", value_name = "DRIVER:ADDR[,KEY=VALUE]", long_help = pose_help(), value_parser = LocalizationConfig::parse)]
     pub pose: Vec<LocalizationConfig>,
 
     /// Name of a vehicle and its object in the localization system; may be repeated
     ///
     /// Default: the [[vehicles]] of arena.toml, else vizflyt.
-    #[arg(long = "vehicle", value_name = "NAME")]
+    #[arg(long = "vehicle", help_heading = "Localization", value_name = "NAME")]
     pub vehicles: Vec<String>,
 
     /// Renderer: a graphics card if available, the CPU, or any graphics adapter
-    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
 
     /// Level of detail in large scenes
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "HOW", default_value_t)]
     pub detail: DetailKind,
 
     /// Memory for the blocks of a packed scene, which is rendered from the disk [MiB]
-    #[arg(long, value_name = "MIB", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, help_heading = "Rendering", value_name = "MIB", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(1..))]
     pub scene_memory: u32,
 
     /// Whether the scene was trained with anti-aliasing (mip-splatting)
     ///
     /// auto: as set in its arena, else in its file.
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "HOW", default_value_t)]
     pub antialiased: Antialiased,
 
     /// Maximum render rate [Hz]
-    #[arg(long, value_name = "HZ", default_value_t = 120.0, value_parser = rate)]
+    #[arg(long, help_heading = "Rendering", value_name = "HZ", default_value_t = 120.0, value_parser = rate)]
     pub max_rate: f64,
 
     /// JPEG quality of the colour images, 1 to 100
-    #[arg(long, value_name = "Q", default_value_t = 93, value_parser = clap::value_parser!(u8).range(1..=100))]
+    #[arg(long, help_heading = "Images", value_name = "Q", default_value_t = 93, value_parser = clap::value_parser!(u8).range(1..=100))]
     pub quality: u8,
 
     /// Compression of colour
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, help_heading = "Images", value_enum, default_value_t)]
     pub color: Color,
 
     /// Compression of depth; both are exact
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, help_heading = "Images", value_enum, default_value_t)]
     pub depth: Depth,
 
     /// Maximum depth error K z², but at least 1 mm [default: exact]
     ///
     /// Saves half of the bytes or more; K = 0.001 is 25 mm at 5 m.
-    #[arg(long, value_name = "K", value_parser = depth_bound)]
+    #[arg(long, help_heading = "Images", value_name = "K", value_parser = depth_bound)]
     pub depth_error: Option<DepthBound>,
 
     /// Congestion control of the image stream
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, help_heading = "Network", value_enum, default_value_t)]
     pub congestion: Congestion,
 
     /// Image properties that may be reduced for a slow link
     ///
     /// Quality is reduced before rate, and rate before size.
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, help_heading = "Network", value_enum, default_value_t)]
     pub adapt: Adaptation,
 
     /// Placement of a scene without an arena
@@ -136,55 +136,55 @@ pub struct ServeArgs {
     pub bare: BareArgs,
 
     /// Isolate the vehicles: they neither see each other nor collide
-    #[arg(long)]
+    #[arg(long, help_heading = "Scene")]
     pub apart: bool,
 
     /// Seed for the initial phase of objects that set none in arena.toml
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, help_heading = "Scene", value_name = "N", default_value_t = 0)]
     pub seed: u64,
 
     /// Open a pairing at the start and print its code: `instructor`, or `team:VEHICLE`
-    #[arg(long, value_name = "ROLE", value_parser = parse_grant)]
+    #[arg(long, help_heading = "Network", value_name = "ROLE", value_parser = parse_grant)]
     pub pair: Option<Grant>,
 
     /// Print the page's addresses with keys, for other computers
     ///
     /// They are always printed if --http is not only this computer.
-    #[arg(long)]
+    #[arg(long, help_heading = "Web page")]
     pub print_page_keys: bool,
 
     /// Users that must log in on the page
     ///
     /// `vizflyt password` sets the instructor's password.
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, help_heading = "Web page", value_enum, default_value_t)]
     pub login: Login,
 
     /// Folder of this server's key and of paired.toml, the list of paired computers
     ///
     /// Default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, help_heading = "Network", value_name = "DIR")]
     pub keys: Option<PathBuf>,
 
     /// Database of flights: a file, postgres://USER:PASSWORD@HOST/NAME, or none
     ///
     /// Default: $XDG_DATA_HOME/vizflyt/leaderboard.sqlite or ~/.local/share/vizflyt/leaderboard.sqlite.
-    #[arg(long, value_name = "FILE|URL|none", value_parser = run_storage, value_hint = ValueHint::FilePath)]
+    #[arg(long, help_heading = "Leaderboard", value_name = "FILE|URL|none", value_parser = run_storage, value_hint = ValueHint::FilePath)]
     pub leaderboard: Option<RunStorage>,
 
     /// Maximum of a team's official runs on a course; further runs are practice
     ///
     /// Default: unlimited.
-    #[arg(long, value_name = "N")]
+    #[arg(long, help_heading = "Leaderboard", value_name = "N")]
     pub official_attempts: Option<u32>,
 
     /// File of the lab day with its checks and queue, or none
     ///
     /// Default: lab-day.json next to the leaderboard's file; none without a leaderboard.
-    #[arg(long, value_name = "FILE|none", value_parser = lab_storage, value_hint = ValueHint::FilePath)]
+    #[arg(long, help_heading = "Leaderboard", value_name = "FILE|none", value_parser = lab_storage, value_hint = ValueHint::FilePath)]
     pub lab_day: Option<LabStorage>,
 
     /// Print JSON lines on standard output: ready, events, report
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     pub json: bool,
 
     /// Exit when standard input closes

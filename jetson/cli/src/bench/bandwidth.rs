@@ -31,19 +31,19 @@ Examples:
 pub(super) struct BandwidthArgs {
     /// Arena (arena.toml or its folder) or scene file
     scene: PathBuf,
-    /// Camera of a view, as for `vizflyt scene render`; can be repeated
-    #[arg(long = "camera", value_name = "CAM.json")]
-    cameras: Vec<PathBuf>,
     #[command(flatten)]
     bare: BareArgs,
+    /// Camera of a view, as for `vizflyt scene render`; can be repeated
+    #[arg(long = "camera", help_heading = "Rendering", value_name = "CAM.json")]
+    cameras: Vec<PathBuf>,
     /// Image size; can be repeated [default: 320x240, 640x480, 1280x720]
-    #[arg(long, value_name = "WxH")]
+    #[arg(long, help_heading = "Rendering", value_name = "WxH")]
     size: Vec<ImageSize>,
     /// Renderer: usable graphics card, processor, or any graphics adapter
-    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
     /// Print a JSON array
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     json: bool,
 }
 

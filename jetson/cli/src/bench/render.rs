@@ -35,39 +35,40 @@ Examples:
 pub(super) struct RenderArgs {
     /// Scene file, packed scene (`scene pack`), or arena.toml (then its scene)
     scene: PathBuf,
-    /// Camera, as for `vizflyt scene render`; can be repeated
-    #[arg(long = "camera", value_name = "CAM.json", required = true)]
-    cameras: Vec<PathBuf>,
-    /// Image size instead of the camera's; the field of view stays the same
-    #[arg(long, value_name = "WxH")]
-    size: Option<ImageSize>,
-    /// Renderer: usable graphics card, processor, or any graphics adapter
-    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
-    renderer: RendererKind,
-    /// Level of detail for large scenes
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
-    detail: DetailKind,
-    #[arg(long, value_name = "NAME", help = format!(
+    /// Also render in this light and weather, and print the ratio
+    #[arg(long, help_heading = "Scene", value_name = "NAME", long_help = format!(
         "Also render each image in this light and weather, alternating with a clear one, and print the ratio: {}",
         Variant::names()
     ))]
     environment: Option<Variant>,
+    /// Camera, as for `vizflyt scene render`; can be repeated
+    #[arg(long = "camera", help_heading = "Rendering", value_name = "CAM.json", required = true)]
+    cameras: Vec<PathBuf>,
+    /// Image size instead of the camera's; the field of view stays the same
+    #[arg(long, help_heading = "Rendering", value_name = "WxH")]
+    size: Option<ImageSize>,
+    /// Renderer: usable graphics card, processor, or any graphics adapter
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "KIND", default_value_t)]
+    renderer: RendererKind,
+    /// Level of detail for large scenes
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "HOW", default_value_t)]
+    detail: DetailKind,
+    /// Memory for the blocks of a packed scene [MiB]
+    ///
+    /// Measured images do not wait for blocks.
+    #[arg(long, help_heading = "Rendering", value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(1..))]
+    memory: u32,
+    /// Measured images per camera, after a warm-up
+    #[arg(long, help_heading = "Measurement", value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    images: u32,
     /// Also measure the limits of this processor, and compare each pass with them
     ///
     /// Prints the minimum time of each pass: the time for the pixels of its splats if all lanes of
     /// the vector units are used, or the time to transfer its bytes.
-    #[arg(long, conflicts_with = "environment")]
+    #[arg(long, help_heading = "Measurement", conflicts_with = "environment")]
     limits: bool,
-    /// Measured images per camera, after a warm-up
-    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
-    images: u32,
-    /// Memory for the blocks of a packed scene [MiB]
-    ///
-    /// Measured images do not wait for blocks.
-    #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(1..))]
-    memory: u32,
     /// Print one JSON object
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     json: bool,
 }
 

@@ -42,39 +42,44 @@ pub(crate) struct EmulateArgs {
     /// Serial port of the autopilot: `pty`, `pty:PATH` or a device
     ///
     /// `pty` makes a pseudo-terminal. `pty:PATH` also links PATH to it.
-    #[arg(long, value_name = "UART", default_value = "pty")]
+    #[arg(long, help_heading = "MAVLink", value_name = "UART", default_value = "pty")]
     uart: Uart,
+    /// Baud rate of the port
+    ///
+    /// A pseudo-terminal has the timing of a serial line at this rate.
+    #[arg(long, help_heading = "MAVLink", value_name = "BAUD")]
+    baud: Option<u32>,
     /// UDP address for clients
-    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:14555")]
+    #[arg(
+        long,
+        help_heading = "MAVLink",
+        value_name = "ADDR:PORT",
+        default_value = "127.0.0.1:14555"
+    )]
     listen: SocketAddrV4,
     /// TCP address for clients [default: no TCP]
-    #[arg(long, value_name = "ADDR:PORT")]
+    #[arg(long, help_heading = "MAVLink", value_name = "ADDR:PORT")]
     tcp: Option<SocketAddrV4>,
+    /// Client to which the bridge sends before it has received a packet
+    #[arg(long, help_heading = "MAVLink", value_name = "ADDR:PORT")]
+    client: Option<SocketAddrV4>,
     /// TCP address of the status page [default: no page]
-    #[arg(long, value_name = "ADDR:PORT")]
+    #[arg(long, help_heading = "Web page", value_name = "ADDR:PORT")]
     page: Option<SocketAddrV4>,
     /// Accept firmware signed by this key, at the page
     ///
     /// `vizflyt bridge firmware key` prints the key. Firmware is verified as on a chip, but not
     /// run.
-    #[arg(long, value_name = "HEX", requires = "page", value_parser = firmware_key)]
+    #[arg(long, help_heading = "Web page", value_name = "HEX", requires = "page", value_parser = firmware_key)]
     firmware_key: Option<Key>,
-    /// Client to which the bridge sends before it has received a packet
-    #[arg(long, value_name = "ADDR:PORT")]
-    client: Option<SocketAddrV4>,
-    /// Baud rate of the port
-    ///
-    /// A pseudo-terminal has the timing of a serial line at this rate.
-    #[arg(long, value_name = "BAUD")]
-    baud: Option<u32>,
     /// Other setting, as in `vizflyt bridge configure`; can be repeated
-    #[arg(long = "set", value_name = "NAME=VALUE")]
+    #[arg(long = "set", help_heading = "Bridge", value_name = "NAME=VALUE")]
     settings: Vec<String>,
     /// File for the bridge's flash, so that saved settings persist
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Bridge", value_name = "FILE")]
     flash: Option<PathBuf>,
     /// Print JSON lines on stdout: one when ready, one report at the end
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     json: bool,
     /// End when stdin closes
     #[arg(long, hide = true)]

@@ -31,18 +31,19 @@ use crate::lab::{self, LabArgs, LabFlight};
                                                            the real lab
 
 The vehicle lands when the plugin ends, hangs or is killed, when poses stop, and on Ctrl-C.
-Options that are not given come from jetson.toml.")]
+Options that are not given come from jetson.toml. Options under Scene, Localization, Vehicle,
+Rendering and Web page are for the simulated lab.")]
 pub(crate) struct FlyArgs {
-    #[command(flatten)]
-    runtime: vizflyt_runtime::FlyArgs,
     /// Restart the plugin when one of its files is saved; the vehicle holds meanwhile
-    #[arg(long, conflicts_with = "attach")]
+    #[arg(long, help_heading = "Plugin", conflicts_with = "attach")]
     watch: bool,
     /// Fly in the simulated lab even if jetson.toml names a real one
     #[arg(long, conflicts_with = "at")]
     sim: bool,
-    #[command(flatten, next_help_heading = "The simulated lab")]
+    #[command(flatten)]
     lab: LabArgs,
+    #[command(flatten)]
+    runtime: vizflyt_runtime::FlyArgs,
 }
 
 /// Flies; returns success only if the flight finished, or landed as commanded.

@@ -54,73 +54,80 @@ use self::report::Parts;
 /// Options of the simulated lab.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct LabArgs {
-    #[arg(long, help = format!(
+    #[arg(long, help_heading = "Scene", help = format!(
+        "Scene: {}; or the path of a scene or arena.toml", SceneKind::names()
+    ), long_help = format!(
         "Scene: {}; or the path of a scene folder, an arena.toml or a scene file [default: forest; room with \
          --localization tags or mat]", SceneKind::names()
     ))]
     pub scene: Option<String>,
-    #[arg(long, value_name = "NAME|FILE", value_parser = project_name, help = format!(
+    #[arg(long, help_heading = "Scene", value_name = "NAME|FILE", value_parser = project_name, help = format!(
+        "Project: {}; or FILE.toml", projects::NAMES.join(", ")
+    ), long_help = format!(
         "Course project, with its scene, sensors and rules: {}; or a file FILE.toml; replaces --scene",
         projects::NAMES.join(", ")
     ))]
     pub project: Option<String>,
     /// Level of the project: ug (with depth) or g (without depth) [default: ug]
-    #[arg(long, value_name = "LEVEL", requires = "project")]
+    #[arg(long, help_heading = "Scene", value_name = "LEVEL", requires = "project")]
     pub level: Option<Level>,
-    #[arg(long, value_name = "NAME", requires = "project", help = format!(
+    /// Light and weather of the project [default: day]
+    #[arg(long, help_heading = "Scene", value_name = "NAME", requires = "project", long_help = format!(
         "Light and weather of the project: {} [default: day]", Variant::names()
     ))]
     pub variant: Option<Variant>,
-    #[arg(long, value_name = "NAME", conflicts_with = "project", help = format!(
+    /// Light and weather of a generated scene or a scene file [default: day]
+    #[arg(long, help_heading = "Scene", value_name = "NAME", conflicts_with = "project", long_help = format!(
         "Light and weather of a generated scene or a scene file: {} [default: day]", Variant::names()
     ))]
     pub environment: Option<Variant>,
     #[command(flatten)]
     pub bare: BareArgs,
     /// Seed of the generated scene and of the simulator's noise [default: 7]
-    #[arg(long)]
+    #[arg(long, help_heading = "Scene")]
     pub seed: Option<u64>,
-    /// Renderer: usable graphics card, processor, or any graphics adapter
-    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
-    pub renderer: RendererKind,
-    /// Level of detail for large scenes
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
-    pub detail: DetailKind,
-    /// Whether the scene was trained with anti-aliasing (mip-splatting)
-    ///
-    /// auto: as in the arena, or else as in the scene's file.
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
-    pub antialiased: Antialiased,
-    /// Maximum render rate [Hz] [default: 120]
-    #[arg(long, value_name = "HZ", value_parser = vizflyt_server::args::rate)]
-    pub max_rate: Option<f64>,
-    /// Open no browser
-    #[arg(long)]
-    pub headless: bool,
     /// Localization of the vehicle: simulated motion capture or AprilTags
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    #[arg(long, help_heading = "Localization", value_enum, value_name = "HOW", default_value_t)]
     pub localization: Localization,
-    /// Route all MAVLink bytes through the vehicle's Wi-Fi bridge, emulated here
-    #[arg(long)]
-    pub through_bridge: bool,
-    /// Simulated inertial sensor
-    #[arg(long, value_name = "NAME", default_value_t, help = format!(
+    /// Also send the vehicle's true pose to this address, to measure localization
+    ///
+    /// As in `vizflyt sim --truth-to`.
+    #[arg(long, help_heading = "Localization", value_name = "ADDR:PORT")]
+    pub truth_to: Option<SocketAddr>,
+    #[arg(long, help_heading = "Vehicle", value_name = "NAME", default_value_t, help = format!(
+        "Inertial sensor: {}", ImuModel::names()
+    ), long_help = format!(
         "Simulated inertial sensor, with the noise of its data sheet; frame: with the vibration of a small frame: {}",
         ImuModel::names()
     ))]
     pub imu: ImuModel,
     /// Start-up times of a real autopilot, as in `vizflyt sim --realistic-startup`
-    #[arg(long)]
+    #[arg(long, help_heading = "Vehicle")]
     pub realistic_startup: bool,
-    /// Also send the vehicle's true pose to this address, to measure localization
+    /// Route all MAVLink bytes through the vehicle's Wi-Fi bridge, emulated here
+    #[arg(long, help_heading = "Vehicle")]
+    pub through_bridge: bool,
+    /// Renderer: usable graphics card, processor, or any graphics adapter
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "KIND", default_value_t)]
+    pub renderer: RendererKind,
+    /// Level of detail for large scenes
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "HOW", default_value_t)]
+    pub detail: DetailKind,
+    /// Whether the scene was trained with anti-aliasing (mip-splatting)
     ///
-    /// As in `vizflyt sim --truth-to`.
-    #[arg(long, value_name = "ADDR:PORT")]
-    pub truth_to: Option<SocketAddr>,
+    /// auto: as in the arena, or else as in the scene's file.
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "HOW", default_value_t)]
+    pub antialiased: Antialiased,
+    /// Maximum render rate [Hz] [default: 120]
+    #[arg(long, help_heading = "Rendering", value_name = "HZ", value_parser = vizflyt_server::args::rate)]
+    pub max_rate: Option<f64>,
+    /// Open no browser
+    #[arg(long, help_heading = "Web page")]
+    pub headless: bool,
     /// Port of the page; 0: port 8377, or a free one if it is in use
     ///
     /// A browser stores flights by address, so it finds them again at the same port.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, help_heading = "Web page", default_value_t = 0)]
     pub port: u16,
 }
 

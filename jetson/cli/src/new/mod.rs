@@ -34,6 +34,8 @@ pub(crate) struct NewArgs {
     #[arg(long, value_enum, default_value_t)]
     lang: Language,
     #[arg(long, value_name = "NAME", help = format!(
+        "Project: {}, {}", starter::IN_THE_NET.join(", "), projects::NAMES.join(", ")
+    ), long_help = format!(
         "Course project: {}, {}; or a folder projects/NAME",
         starter::IN_THE_NET.join(", "),
         projects::NAMES.join(", ")

@@ -36,49 +36,54 @@ pub(crate) struct LocateArgs {
     /// Configuration file; not needed with --simulated
     #[arg(required_unless_present = "simulated", conflicts_with = "simulated")]
     config: Option<PathBuf>,
-    /// Use simulated webcams at the ends of the netted hall
-    ///
-    /// They see a cube of tags at the true pose of the vehicle. In a configuration file, cameras
-    /// with the source "simulated" do the same.
-    #[arg(long)]
-    simulated: bool,
-    /// Number of simulated webcams, 1 to 4
-    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=4), requires = "simulated")]
-    webcams: u8,
-    /// Simulate a webcam under the vehicle that sees a mat of tags on the floor
-    #[arg(long, requires = "simulated", conflicts_with = "webcams")]
-    inside_out: bool,
-    /// Pad of small tags on that mat: centre east, north and size; can be repeated
-    ///
-    /// In metres, world frame. [default size: 0.5,0.35]
-    #[arg(long = "pad", value_name = "X,Y[,LENGTH,WIDTH]", value_parser = super::print::pad, allow_hyphen_values = true, requires = "inside_out")]
-    pads: Vec<Pad>,
-    /// Seed of the simulated errors of survey and mount
-    #[arg(long, default_value_t = 7, requires = "inside_out")]
-    seed: u64,
     /// Name of the vehicle [default: that of the file]
-    #[arg(long)]
+    #[arg(long, help_heading = "Localization")]
     object: Option<String>,
     /// Source of a camera's images instead of its file's; can be repeated
     ///
     /// A device, a folder or a video.
-    #[arg(long = "source", value_name = "CAMERA=SOURCE", value_parser = parse_source)]
+    #[arg(long = "source", help_heading = "Localization", value_name = "CAMERA=SOURCE", value_parser = parse_source)]
     sources: Vec<(String, String)>,
+    /// Use simulated webcams at the ends of the netted hall
+    ///
+    /// They see a cube of tags at the true pose of the vehicle. In a configuration file, cameras
+    /// with the source "simulated" do the same.
+    #[arg(long, help_heading = "Simulation")]
+    simulated: bool,
+    /// Number of simulated webcams, 1 to 4
+    #[arg(long, help_heading = "Simulation", default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=4), requires = "simulated")]
+    webcams: u8,
+    /// Simulate a webcam under the vehicle that sees a mat of tags on the floor
+    #[arg(long, help_heading = "Simulation", requires = "simulated", conflicts_with = "webcams")]
+    inside_out: bool,
+    /// Pad of small tags on that mat: centre east, north and size; can be repeated
+    ///
+    /// In metres, world frame. [default size: 0.5,0.35]
+    #[arg(long = "pad", help_heading = "Simulation", value_name = "X,Y[,LENGTH,WIDTH]", value_parser = super::print::pad, allow_hyphen_values = true, requires = "inside_out")]
+    pads: Vec<Pad>,
+    /// Seed of the simulated errors of survey and mount
+    #[arg(long, help_heading = "Simulation", default_value_t = 7, requires = "inside_out")]
+    seed: u64,
     /// Address for true poses, for simulated cameras: `vizflyt sim --truth-to` this
-    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
+    #[arg(
+        long,
+        help_heading = "Simulation",
+        value_name = "ADDR:PORT",
+        default_value = "127.0.0.1:0"
+    )]
     truth: SocketAddr,
     /// Destination of the poses: `vizflyt serve --pose json:ADDR`; can be repeated
-    #[arg(long, value_name = "HOST:PORT", value_parser = resolve)]
+    #[arg(long, help_heading = "Network", value_name = "HOST:PORT", value_parser = resolve)]
     to: Vec<SocketAddr>,
+    /// Address of the live view: images, detections, residuals
+    #[arg(long, help_heading = "Network", value_name = "ADDR:PORT")]
+    http: Option<SocketAddr>,
     /// Print JSON lines: `ready`, `status` once a second, `report`
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     json: bool,
     /// Print every pose as a JSON line when it is sent
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     poses: bool,
-    /// Address of the live view: images, detections, residuals
-    #[arg(long, value_name = "ADDR:PORT")]
-    http: Option<SocketAddr>,
     /// End when standard input closes
     #[arg(long, hide = true)]
     lifeline: bool,

@@ -31,96 +31,96 @@ pub(super) struct PrintArgs {
 enum PrintCommand {
     /// Cube with tags for the vehicle, seen by cameras in the room
     Cube {
-        #[command(flatten)]
-        common: Common,
         /// Id of the front face; left, back, right, top, bottom follow
-        #[arg(long, value_name = "ID", default_value_t = 0)]
+        #[arg(long, help_heading = "Tags", value_name = "ID", default_value_t = 0)]
         first_id: u32,
         /// Number of faces; 5: without the bottom
-        #[arg(long, value_name = "N", default_value_t = 5)]
+        #[arg(long, help_heading = "Tags", value_name = "N", default_value_t = 5)]
         faces: u32,
         /// Edge of the cube [mm]
-        #[arg(long, value_name = "MM", default_value_t = 170.0)]
+        #[arg(long, help_heading = "Tags", value_name = "MM", default_value_t = 170.0)]
         face_mm: f64,
         /// Edge of a tag's black square [mm]
-        #[arg(long, value_name = "MM", default_value_t = 132.0)]
+        #[arg(long, help_heading = "Tags", value_name = "MM", default_value_t = 132.0)]
         tag_mm: f64,
         /// Centre of the cube relative to the vehicle's: forward, left, up [m]
-        #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
+        #[arg(long, help_heading = "Tags", value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
         middle_m: DVec3,
+        #[command(flatten)]
+        common: Common,
     },
     /// Grid of tags for floor or wall, seen by a camera on the vehicle
     ///
     /// Printed on as many sheets as needed. Cameras in the room are also surveyed with it.
     Mat {
-        #[command(flatten)]
-        common: Common,
-        /// Id of the first tag; ids increase eastwards, then northwards
-        #[arg(long, value_name = "ID", default_value_t = 100)]
-        first_id: u32,
-        /// Number of tags from west to east
-        #[arg(long, value_name = "N", default_value_t = 4)]
-        columns: u32,
-        /// Number of tags from south to north
-        #[arg(long, value_name = "N", default_value_t = 6)]
-        rows: u32,
-        /// Distance between the centres of neighbouring tags [mm]
-        #[arg(long, value_name = "MM", default_value_t = 95.0)]
-        pitch_mm: f64,
-        /// Edge of a tag's black square [mm]
-        #[arg(long, value_name = "MM", default_value_t = 70.0)]
-        tag_mm: f64,
         /// Size the tags for a hall of this length, width and height [m]
         ///
         /// The tags are large enough for a survey of webcams in the upper corners. The paper size
         /// follows from the tag size.
-        #[arg(long, value_name = "LxWxH", value_parser = hall,
+        #[arg(long, help_heading = "Tags", value_name = "LxWxH", value_parser = hall,
             conflicts_with_all = ["columns", "rows", "pitch_mm", "tag_mm", "paper", "fly_over"])]
         for_hall: Option<DVec3>,
         /// Size of the area that a vehicle with a webcam under it flies over [m]
         ///
         /// Length is east, width is north. Prints large tags half a metre apart, one per sheet of
         /// A3.
-        #[arg(long, value_name = "LxW", value_parser = area,
+        #[arg(long, help_heading = "Tags", value_name = "LxW", value_parser = area,
             conflicts_with_all = ["columns", "rows", "pitch_mm", "tag_mm", "paper"])]
         fly_over: Option<DVec2>,
         /// Pad for take-off and landing: centre east, north and size; can be repeated
         ///
         /// Small tags for a camera 80 mm or more above the floor. In metres, frame of the room.
         /// [default size: 0.5,0.35]
-        #[arg(long = "pad", value_name = "X,Y[,LENGTH,WIDTH]", value_parser = pad, allow_hyphen_values = true, requires = "fly_over")]
+        #[arg(long = "pad", help_heading = "Tags", value_name = "X,Y[,LENGTH,WIDTH]", value_parser = pad, allow_hyphen_values = true, requires = "fly_over")]
         pads: Vec<Pad>,
+        /// Id of the first tag; ids increase eastwards, then northwards
+        #[arg(long, help_heading = "Tags", value_name = "ID", default_value_t = 100)]
+        first_id: u32,
+        /// Number of tags from west to east
+        #[arg(long, help_heading = "Tags", value_name = "N", default_value_t = 4)]
+        columns: u32,
+        /// Number of tags from south to north
+        #[arg(long, help_heading = "Tags", value_name = "N", default_value_t = 6)]
+        rows: u32,
+        /// Distance between the centres of neighbouring tags [mm]
+        #[arg(long, help_heading = "Tags", value_name = "MM", default_value_t = 95.0)]
+        pitch_mm: f64,
+        /// Edge of a tag's black square [mm]
+        #[arg(long, help_heading = "Tags", value_name = "MM", default_value_t = 70.0)]
+        tag_mm: f64,
         /// Centre of the grid in the room: east, north, up [m]
-        #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
+        #[arg(long, help_heading = "Tags", value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
         middle_m: DVec3,
+        #[command(flatten)]
+        common: Common,
     },
     /// Calibration board: one sheet of tags, to glue on a flat, stiff surface
     Board {
-        #[command(flatten)]
-        common: Common,
         /// Id of the first tag
-        #[arg(long, value_name = "ID", default_value_t = 300)]
+        #[arg(long, help_heading = "Tags", value_name = "ID", default_value_t = 300)]
         first_id: u32,
         /// Edge of a tag's black square [mm]
-        #[arg(long, value_name = "MM", default_value_t = 30.0)]
+        #[arg(long, help_heading = "Tags", value_name = "MM", default_value_t = 30.0)]
         tag_mm: f64,
+        #[command(flatten)]
+        common: Common,
     },
     /// Checkerboard: one sheet, to glue on a flat, stiff surface
     ///
     /// For use of the same images with other calibration programs. The whole checkerboard must be
     /// visible in an image; of the board of tags, any part is enough.
     Checkers {
+        /// Edge of a square [mm]
+        #[arg(long, help_heading = "Tags", value_name = "MM", default_value_t = 25.0)]
+        square_mm: f64,
         /// PDF to write; its layout goes into a .toml file of the same name
-        #[arg(short, long, value_name = "FILE.pdf")]
+        #[arg(short, long, help_heading = "Output", value_name = "FILE.pdf")]
         output: PathBuf,
         /// Paper size
-        #[arg(long, value_enum, default_value_t = PaperName::A4)]
+        #[arg(long, help_heading = "Output", value_enum, default_value_t = PaperName::A4)]
         paper: PaperName,
-        /// Edge of a square [mm]
-        #[arg(long, value_name = "MM", default_value_t = 25.0)]
-        square_mm: f64,
         /// Measured length of the printed scale bar [mm]
-        #[arg(long, value_name = "MM", default_value_t = BAR_MM)]
+        #[arg(long, help_heading = "Output", value_name = "MM", default_value_t = BAR_MM)]
         bar_mm: f64,
     },
 }
@@ -128,17 +128,17 @@ enum PrintCommand {
 #[derive(Args, Debug)]
 struct Common {
     /// PDF to write; its layout goes into a .toml file of the same name
-    #[arg(short, long, value_name = "FILE.pdf")]
+    #[arg(short, long, help_heading = "Output", value_name = "FILE.pdf")]
     output: PathBuf,
     /// Paper size
-    #[arg(long, value_enum, default_value_t = PaperName::A4)]
+    #[arg(long, help_heading = "Output", value_enum, default_value_t = PaperName::A4)]
     paper: PaperName,
-    /// Tag family
-    #[arg(long, value_name = "NAME", default_value = "tag36h11", value_parser = family)]
-    family: TagFamily,
     /// Measured length of the printed scale bar [mm]
-    #[arg(long, value_name = "MM", default_value_t = BAR_MM)]
+    #[arg(long, help_heading = "Output", value_name = "MM", default_value_t = BAR_MM)]
     bar_mm: f64,
+    /// Tag family
+    #[arg(long, help_heading = "Tags", value_name = "NAME", default_value = "tag36h11", value_parser = family)]
+    family: TagFamily,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]

@@ -36,13 +36,13 @@ pub struct BareArgs {
     /// Axis of the file that points up, for a scene without an arena.toml [default: -y]
     ///
     /// x, -x, y, -y, z or -z.
-    #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
+    #[arg(long, help_heading = "Scene", value_name = "AXIS", allow_hyphen_values = true)]
     pub up: Option<Up>,
 
     /// Metres per unit of the file, for a scene without an arena.toml
     ///
     /// By default, the core of the scene is assumed to be 3 m high.
-    #[arg(long, value_name = "METRES", value_parser = parse_scale)]
+    #[arg(long, help_heading = "Scene", value_name = "METRES", value_parser = parse_scale)]
     pub scale: Option<f64>,
 }
 

@@ -46,7 +46,7 @@ struct CheckArgs {
     #[arg(required_unless_present = "project", conflicts_with = "project")]
     arena: Option<PathBuf>,
     #[arg(long, value_name = "NAME", help = format!(
-        "A project of the course: {}; or a project file, FILE.toml", projects::NAMES.join(", ")
+        "Project: {}; or FILE.toml", projects::NAMES.join(", ")
     ))]
     project: Option<String>,
     /// Check only this seed of the project

@@ -26,16 +26,17 @@ pub(super) struct NewArgs {
     /// Folder for arena.toml; created if missing
     folder: PathBuf,
     /// Scene file: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Scene", value_name = "FILE")]
     scene: PathBuf,
     #[command(flatten)]
     bare: BareArgs,
-    #[arg(long, value_name = "NAME", default_value_t, help = format!(
+    /// Light and weather
+    #[arg(long, help_heading = "Scene", value_name = "NAME", default_value_t, long_help = format!(
         "Light and weather: {}", Variant::names()
     ))]
     environment: Variant,
     /// Replace an existing arena.toml
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     force: bool,
 }
 

@@ -68,98 +68,123 @@ use crate::shard::Shard;
 docs/guides/datasets.md describes all layers and files.")]
 #[command(group = ArgGroup::new("world").args(["project", "scene"]).required(true))]
 pub struct DatasetArgs {
-    #[arg(long, value_name = "NAME", help = format!(
-        "Generated courses of this project: {}", projects::NAMES.join(", ")
+    #[arg(long, help_heading = "Scene", value_name = "NAME", help = format!(
+        "Project of the courses: {}", projects::NAMES.join(", ")
     ))]
     project: Option<String>,
     /// arena.toml, its folder, or a scene file
-    #[arg(long, value_name = "PATH")]
+    #[arg(long, help_heading = "Scene", value_name = "PATH")]
     scene: Option<PathBuf>,
     #[command(flatten)]
     bare: BareArgs,
     /// Seed of the first course, and of all random values
-    #[arg(long, value_name = "N", default_value_t = 1)]
+    #[arg(long, help_heading = "Scene", value_name = "N", default_value_t = 1)]
     seed: u64,
     /// Number of courses of --project, with consecutive seeds
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    #[arg(long, help_heading = "Scene", value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     seeds: u32,
-    /// Output folder; an interrupted data set is resumed
-    #[arg(short, long, value_name = "DIR")]
-    output: PathBuf,
+    /// Parts of the scene, defined by boxes
+    #[arg(long, help_heading = "Scene", value_name = "FILE.toml")]
+    parts: Option<PathBuf>,
+    /// Randomization from image to image
+    ///
+    /// Light, fog, textures of gates, distractors, vehicles, the camera.
+    #[arg(long, help_heading = "Scene", value_name = "FILE.toml")]
+    randomize: Option<PathBuf>,
+    /// Path with poses: TUM text, EuRoC CSV or a flight's log
+    ///
+    /// Without it, random poses in the free space are used.
+    #[arg(long, help_heading = "Poses", value_name = "FILE")]
+    path: Option<String>,
+    /// Frame of the poses of --path
+    #[arg(long, help_heading = "Poses", value_enum, default_value_t, requires = "path")]
+    path_of: PathOf,
+    /// Minimum distance of random poses from solid space [m]
+    #[arg(
+        long,
+        help_heading = "Poses",
+        value_name = "M",
+        default_value_t = 0.25,
+        conflicts_with = "path"
+    )]
+    clearance: f64,
+    /// Maximum pitch and roll of random poses [deg]
+    #[arg(
+        long,
+        help_heading = "Poses",
+        value_name = "DEG",
+        default_value_t = 15.0,
+        conflicts_with = "path"
+    )]
+    tilt: f64,
+    /// Probability that a random pose looks towards a gate
+    #[arg(
+        long,
+        help_heading = "Poses",
+        value_name = "P",
+        default_value_t = 0.7,
+        conflicts_with = "path"
+    )]
+    look_at_gate: f64,
+    /// Range of distances from that gate [m]
+    #[arg(long, help_heading = "Poses", value_name = "LEAST..MOST", default_value = "0.8..5", value_parser = bounds, conflicts_with = "path")]
+    gate_distance: [f64; 2],
     /// Number of images over all courses [default: 100, or all of --path]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
+    #[arg(long, help_heading = "Images", value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
     images: Option<u64>,
     /// Image size
-    #[arg(long, value_name = "WxH", default_value = "320x240")]
+    #[arg(long, help_heading = "Images", value_name = "WxH", default_value = "320x240")]
     size: ImageSize,
     /// Horizontal field of view [deg]
-    #[arg(long, value_name = "DEG", default_value_t = 90.0)]
+    #[arg(long, help_heading = "Images", value_name = "DEG", default_value_t = 90.0)]
     fov: f64,
     /// Layers to write for each image
     #[arg(
         long,
+        help_heading = "Images",
         value_enum,
         value_delimiter = ',',
         default_value = "rgb,depth,normals,instances,classes,flow"
     )]
     layers: Vec<Layer>,
-    /// Layout of the data set
-    #[arg(long, value_enum, default_value_t = Format::Coco)]
-    format: Format,
+    /// Time between the two images of optical flow, for random poses [s]
+    #[arg(
+        long,
+        help_heading = "Images",
+        value_name = "S",
+        default_value_t = 0.04,
+        conflicts_with = "path"
+    )]
+    flow_dt: f64,
     /// JPEG quality of the colour images [default: PNG]
-    #[arg(long, value_name = "QUALITY", value_parser = clap::value_parser!(u8).range(1..=100))]
+    #[arg(long, help_heading = "Images", value_name = "QUALITY", value_parser = clap::value_parser!(u8).range(1..=100))]
     jpeg: Option<u8>,
+    /// Layout of the data set
+    #[arg(long, help_heading = "Annotations", value_enum, default_value_t = Format::Coco)]
+    format: Format,
     /// Annotated classes [default: all classes of things]
-    #[arg(long, value_name = "CLASS", value_delimiter = ',')]
+    #[arg(long, help_heading = "Annotations", value_name = "CLASS", value_delimiter = ',')]
     things: Vec<String>,
     /// Minimum size of annotated things [px]
-    #[arg(long, value_name = "PX", default_value_t = 12)]
+    #[arg(long, help_heading = "Annotations", value_name = "PX", default_value_t = 12)]
     min_area: u32,
     /// Held-out share of the images; complete courses if there are several
-    #[arg(long, value_name = "SHARE", default_value_t = 0.1)]
+    #[arg(long, help_heading = "Annotations", value_name = "SHARE", default_value_t = 0.1)]
     val: f64,
-    /// Path with poses: TUM text, EuRoC CSV or a flight's log
-    ///
-    /// Without it, random poses in the free space are used.
-    #[arg(long, value_name = "FILE")]
-    path: Option<String>,
-    /// Frame of the poses of --path
-    #[arg(long, value_enum, default_value_t, requires = "path")]
-    path_of: PathOf,
-    /// Minimum distance of random poses from solid space [m]
-    #[arg(long, value_name = "M", default_value_t = 0.25, conflicts_with = "path")]
-    clearance: f64,
-    /// Maximum pitch and roll of random poses [deg]
-    #[arg(long, value_name = "DEG", default_value_t = 15.0, conflicts_with = "path")]
-    tilt: f64,
-    /// Probability that a random pose looks towards a gate
-    #[arg(long, value_name = "P", default_value_t = 0.7, conflicts_with = "path")]
-    look_at_gate: f64,
-    /// Range of distances from that gate [m]
-    #[arg(long, value_name = "LEAST..MOST", default_value = "0.8..5", value_parser = bounds, conflicts_with = "path")]
-    gate_distance: [f64; 2],
-    /// Time between the two images of optical flow, for random poses [s]
-    #[arg(long, value_name = "S", default_value_t = 0.04, conflicts_with = "path")]
-    flow_dt: f64,
-    /// Randomization from image to image
-    ///
-    /// Light, fog, textures of gates, distractors, vehicles, the camera.
-    #[arg(long, value_name = "FILE.toml")]
-    randomize: Option<PathBuf>,
-    /// Parts of the scene, defined by boxes
-    #[arg(long, value_name = "FILE.toml")]
-    parts: Option<PathBuf>,
+    /// Output folder; an interrupted data set is resumed
+    #[arg(short, long, help_heading = "Output", value_name = "DIR")]
+    output: PathBuf,
+    /// PNG or JPEG with a few images and all of their layers
+    #[arg(long, help_heading = "Output", value_name = "FILE")]
+    sheet: Option<PathBuf>,
     /// Render only shard I of N, as 2/4
     ///
     /// The last shard to finish, or a run without this option, writes the annotations.
-    #[arg(long, value_name = "I/N")]
+    #[arg(long, help_heading = "Output", value_name = "I/N")]
     shard: Option<Shard>,
     /// Number of threads [default: one per core]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    #[arg(long, help_heading = "Output", value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
-    /// PNG or JPEG with a few images and all of their layers
-    #[arg(long, value_name = "FILE")]
-    sheet: Option<PathBuf>,
 }
 
 /// Runs `vizflyt dataset`.

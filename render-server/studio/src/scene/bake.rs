@@ -23,16 +23,16 @@ use vizflyt_server::scene::{
 pub(crate) struct BakeArgs {
     /// arena.toml, its folder, or a scene file, which gets a default arena
     scene: PathBuf,
-    /// Voxel size instead of that of [occupancy], for comparison
-    #[arg(long, value_name = "METRES")]
-    voxel: Option<f64>,
-    /// Bake even if stored obstacles exist
-    #[arg(long)]
-    force: bool,
     #[command(flatten)]
     bare: BareArgs,
+    /// Voxel size instead of that of [occupancy], for comparison
+    #[arg(long, help_heading = "Scene", value_name = "METRES")]
+    voxel: Option<f64>,
+    /// Bake even if stored obstacles exist
+    #[arg(long, help_heading = "Output")]
+    force: bool,
     /// Print one JSON object
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     json: bool,
 }
 

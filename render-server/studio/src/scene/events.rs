@@ -33,35 +33,35 @@ Examples:
 pub(crate) struct EventsArgs {
     /// arena.toml with scene and cameras
     arena: PathBuf,
+    /// Seed of the initial phase of objects that set none
+    #[arg(long, help_heading = "Scene", default_value_t = 7)]
+    seed: u64,
     /// Poses of the vehicle's body: TUM text, EuRoC CSV or FLIGHT.mcap#TOPIC
-    #[arg(long, value_name = "PATH")]
+    #[arg(long, help_heading = "Path", value_name = "PATH")]
     path: String,
-    /// Camera of the arena [default: the first one]
-    #[arg(long, value_name = "NAME")]
-    camera: Option<String>,
-    /// Rate of rendered images; motion between two should be less than a pixel
-    #[arg(long, value_name = "HZ", default_value_t = 1000.0, value_parser = rate)]
-    rate: f64,
-    /// Change of the natural logarithm of a pixel's brightness that causes an event
-    #[arg(long, value_name = "LN", default_value_t = 0.2, value_parser = contrast)]
-    contrast: f32,
-    /// Dead time of a pixel after an event
-    #[arg(long, value_name = "MICROSECONDS", default_value_t = 0)]
-    dead: u32,
     /// Start time on the path
-    #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
+    #[arg(long, help_heading = "Path", value_name = "SECONDS", default_value_t = 0.0)]
     from: f64,
     /// Duration on the path [default: to the end]
-    #[arg(long, value_name = "SECONDS")]
+    #[arg(long, help_heading = "Path", value_name = "SECONDS")]
     seconds: Option<f64>,
-    /// Seed of the initial phase of objects that set none
-    #[arg(long, default_value_t = 7)]
-    seed: u64,
+    /// Camera of the arena [default: the first one]
+    #[arg(long, help_heading = "Event camera", value_name = "NAME")]
+    camera: Option<String>,
+    /// Change of the natural logarithm of a pixel's brightness that causes an event
+    #[arg(long, help_heading = "Event camera", value_name = "LN", default_value_t = 0.2, value_parser = contrast)]
+    contrast: f32,
+    /// Dead time of a pixel after an event
+    #[arg(long, help_heading = "Event camera", value_name = "MICROSECONDS", default_value_t = 0)]
+    dead: u32,
+    /// Rate of rendered images; motion between two should be less than a pixel
+    #[arg(long, help_heading = "Rendering", value_name = "HZ", default_value_t = 1000.0, value_parser = rate)]
+    rate: f64,
     /// Renderer: usable graphics card, processor, or any graphics adapter
-    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
     /// File to write
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, help_heading = "Output", value_name = "FILE")]
     out: PathBuf,
 }
 

@@ -34,33 +34,51 @@ pub(crate) struct GenerateArgs {
     #[arg(help = format!("What to generate: {}", SceneKind::names()))]
     kind: SceneKind,
     /// Seed of scene, walk and phone
-    #[arg(long, default_value_t = 7)]
+    #[arg(long, help_heading = "Scene", default_value_t = 7)]
     seed: u64,
-    /// Output folder of the scene; created if missing
-    #[arg(short, long, value_name = "DIR", required_unless_present = "capture")]
-    output: Option<PathBuf>,
     /// Video (.mp4, .mkv, .mov) or folder of JPEG images of a walk through the scene
-    #[arg(long, value_name = "FILE|DIR")]
+    #[arg(long, help_heading = "Capture", value_name = "FILE|DIR")]
     capture: Option<PathBuf>,
     /// Put boards with AprilTags along the walk, also into the scene of --output
-    #[arg(long, requires = "capture")]
+    #[arg(long, help_heading = "Capture", requires = "capture")]
     tags: bool,
     /// Duration of the walk, which ends at its start
-    #[arg(long, value_name = "S", requires = "capture", default_value_t = 50.0)]
+    #[arg(
+        long,
+        help_heading = "Capture",
+        value_name = "S",
+        requires = "capture",
+        default_value_t = 50.0
+    )]
     seconds: f64,
     /// Number of images
     ///
     /// Of a folder: evenly spaced over the walk, 80 by default. Of a video: the first ones.
-    #[arg(long, value_name = "N", requires = "capture")]
+    #[arg(long, help_heading = "Capture", value_name = "N", requires = "capture")]
     frames: Option<u32>,
     /// Image size
-    #[arg(long, value_name = "WxH", requires = "capture", default_value = "640x480")]
+    #[arg(
+        long,
+        help_heading = "Capture",
+        value_name = "WxH",
+        requires = "capture",
+        default_value = "640x480"
+    )]
     size: ImageSize,
     /// Animate moving objects during the walk; without this option they stand still
-    #[arg(long, requires = "capture")]
+    #[arg(long, help_heading = "Capture", requires = "capture")]
     moving: bool,
+    /// Output folder of the scene; created if missing
+    #[arg(
+        short,
+        long,
+        help_heading = "Output",
+        value_name = "DIR",
+        required_unless_present = "capture"
+    )]
+    output: Option<PathBuf>,
     /// Replace existing files
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     force: bool,
 }
 

@@ -44,43 +44,44 @@ Examples:
 pub(crate) struct RenderArgs {
     /// Scene file, packed scene (`scene pack`), or arena.toml (then its scene)
     scene: PathBuf,
-    /// Camera file; can be repeated
-    ///
-    /// With several cameras, each gets a folder of its name in --out.
-    #[arg(long = "camera", value_name = "CAM.json", required = true)]
-    cameras: Vec<PathBuf>,
-    /// Output folder; created if missing
-    #[arg(long, value_name = "DIR", default_value = ".")]
-    out: PathBuf,
-    /// File format: png for viewing, npy for computing
-    #[arg(long, value_enum, default_value_t)]
-    format: FileFormat,
-    #[arg(long, value_name = "NAME", default_value_t, help = format!(
+    /// Light and weather
+    #[arg(long, help_heading = "Scene", value_name = "NAME", default_value_t, long_help = format!(
         "Light and weather: {}", Variant::names()
     ))]
     environment: Variant,
     /// Time since the start of the arena's clock, for moving objects and weather
-    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]
+    #[arg(long, help_heading = "Scene", value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]
     at: f64,
     /// Seed of weather, and of the initial phase of objects that set none
-    #[arg(long, default_value_t = 7)]
+    #[arg(long, help_heading = "Scene", default_value_t = 7)]
     seed: u64,
+    /// Camera file; can be repeated
+    ///
+    /// With several cameras, each gets a folder of its name in --out.
+    #[arg(long = "camera", help_heading = "Rendering", value_name = "CAM.json", required = true)]
+    cameras: Vec<PathBuf>,
     /// Renderer: usable graphics card, processor, or any graphics adapter
-    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
     /// Level of detail for large scenes; flights use adaptive
-    #[arg(long, value_enum, value_name = "HOW", default_value_t = DetailKind::Full)]
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "HOW", default_value_t = DetailKind::Full)]
     detail: DetailKind,
     /// Whether the scene was trained with anti-aliasing (mip-splatting)
     ///
     /// auto: as in the arena, or else as in the scene's file.
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "HOW", default_value_t)]
     antialiased: Antialiased,
     /// Memory for the blocks of a packed scene [MiB]
     ///
     /// A packed scene is always rendered with adaptive detail.
-    #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, help_heading = "Rendering", value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(1..))]
     memory: u32,
+    /// Output folder; created if missing
+    #[arg(long, help_heading = "Output", value_name = "DIR", default_value = ".")]
+    out: PathBuf,
+    /// File format: png for viewing, npy for computing
+    #[arg(long, help_heading = "Output", value_enum, default_value_t)]
+    format: FileFormat,
 }
 
 /// Default memory for the blocks of a packed scene. [MiB]

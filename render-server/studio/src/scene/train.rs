@@ -37,49 +37,49 @@ Examples:
 pub(crate) struct TrainArgs {
     /// Folder with photos and their poses
     dataset: PathBuf,
-    /// Scene file to write; its name determines the format: .ply, .spz, .sog, ...
-    #[arg(short, long, value_name = "FILE")]
-    output: PathBuf,
-    /// Replace an existing file
-    #[arg(long)]
-    force: bool,
     /// Number of steps, one photo each
-    #[arg(long, default_value_t = 3000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(long, help_heading = "Training", default_value_t = 3000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     steps: u32,
     /// Maximum number of splats
-    #[arg(long, default_value_t = 60_000, value_name = "N", value_parser = splats)]
+    #[arg(long, help_heading = "Training", default_value_t = 60_000, value_name = "N", value_parser = splats)]
     splats: usize,
     /// Maximum image width; wider photos are downscaled [px]
-    #[arg(long, default_value_t = 320, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
+    #[arg(long, help_heading = "Training", default_value_t = 320, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     width: u32,
     /// Degree of spherical harmonics: how colours vary with the viewing direction
-    #[arg(long, default_value_t = 2, value_name = "0..3", value_parser = clap::value_parser!(u8).range(0..=3))]
+    #[arg(long, help_heading = "Training", default_value_t = 2, value_name = "0..3", value_parser = clap::value_parser!(u8).range(0..=3))]
     sh_degree: u8,
+    /// Hold out every N-th photo for evaluation; 0: none
+    #[arg(long, help_heading = "Training", default_value_t = 8, value_name = "N")]
+    hold_out: usize,
+    /// Assume equal brightness and colour of all photos, instead of solving for them
+    #[arg(long, help_heading = "Training")]
+    no_exposure: bool,
+    /// Train for a renderer that dims splats smaller than a pixel (mip-splatting)
+    #[arg(long, help_heading = "Training")]
+    antialiased: bool,
     /// Renderer of photos and derivatives
-    #[arg(long, value_enum, default_value_t, value_name = "KIND")]
+    #[arg(long, help_heading = "Training", value_enum, default_value_t, value_name = "KIND")]
     renderer: RendererKind,
     /// Random seed
     ///
     /// The same dataset, options and seed give the same scene on the same kind of processor or
     /// card.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, help_heading = "Training", default_value_t = 1)]
     seed: u64,
-    /// Hold out every N-th photo for evaluation; 0: none
-    #[arg(long, default_value_t = 8, value_name = "N")]
-    hold_out: usize,
-    /// Assume equal brightness and colour of all photos, instead of solving for them
-    #[arg(long)]
-    no_exposure: bool,
-    /// Train for a renderer that dims splats smaller than a pixel (mip-splatting)
-    #[arg(long)]
-    antialiased: bool,
     /// Resume an interrupted training with the same photos and options
     ///
     /// The state is saved every minute.
-    #[arg(long)]
+    #[arg(long, help_heading = "Training")]
     resume: bool,
+    /// Scene file to write; its name determines the format: .ply, .spz, .sog, ...
+    #[arg(short, long, help_heading = "Output", value_name = "FILE")]
+    output: PathBuf,
+    /// Replace an existing file
+    #[arg(long, help_heading = "Output")]
+    force: bool,
     /// File for settings, quality and times of the training, as JSON
-    #[arg(long, value_name = "FILE.json")]
+    #[arg(long, help_heading = "Output", value_name = "FILE.json")]
     report: Option<PathBuf>,
 }
 

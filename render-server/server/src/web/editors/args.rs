@@ -24,33 +24,33 @@ pub struct ViewArgs {
     /// Scene file of any format, or an arena.toml
     pub scene: PathBuf,
 
-    /// Address of the page; port 0 selects a free one
-    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
-    pub http: SocketAddr,
-
-    /// Renderer: usable graphics card, processor, or any graphics adapter
-    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
-    pub renderer: RendererKind,
-
-    /// Level of detail for large scenes
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
-    pub detail: DetailKind,
-
-    /// Whether the scene was trained with anti-aliasing (mip-splatting)
-    ///
-    /// auto: as in the arena, or else as in the scene's file.
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
-    pub antialiased: Antialiased,
-
     /// Placement of a scene without an arena
     #[command(flatten)]
     pub bare: BareArgs,
 
     /// Seed of the initial phase of moving objects that set none
-    #[arg(long, default_value_t = 7)]
+    #[arg(long, help_heading = "Scene", default_value_t = 7)]
     pub seed: u64,
 
+    /// Renderer: usable graphics card, processor, or any graphics adapter
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "KIND", default_value_t)]
+    pub renderer: RendererKind,
+
+    /// Level of detail for large scenes
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "HOW", default_value_t)]
+    pub detail: DetailKind,
+
+    /// Whether the scene was trained with anti-aliasing (mip-splatting)
+    ///
+    /// auto: as in the arena, or else as in the scene's file.
+    #[arg(long, help_heading = "Rendering", value_enum, value_name = "HOW", default_value_t)]
+    pub antialiased: Antialiased,
+
+    /// Address of the page; port 0 selects a free one
+    #[arg(long, help_heading = "Web page", value_name = "ADDR", default_value = "127.0.0.1:0")]
+    pub http: SocketAddr,
+
     /// Only print the page's address
-    #[arg(long)]
+    #[arg(long, help_heading = "Web page")]
     pub no_browser: bool,
 }

@@ -49,51 +49,51 @@ x, y, z [m]. It can also be a TUM file (stamp tx ty tz qx qy qz qw), or an expor
 pub(crate) struct AlignArgs {
     /// Arena with a scene file, as made by `vizflyt arena new`
     arena: PathBuf,
+    /// Photos with poses from which the scene was trained
+    #[arg(long, help_heading = "Photos", value_name = "DATASET")]
+    capture: Option<PathBuf>,
     /// Layout of printed tags in the capture, surveyed in the room
     ///
     /// `vizflyt tags print` writes the layout.
-    #[arg(long, value_name = "LAYOUT", requires = "capture")]
+    #[arg(long, help_heading = "Scale and frame", value_name = "LAYOUT", requires = "capture")]
     tags: Option<PathBuf>,
     /// Motion capture track of a marker fixed to the camera during the capture
-    #[arg(long, value_name = "TRACK", requires = "capture")]
+    #[arg(long, help_heading = "Scale and frame", value_name = "TRACK", requires = "capture")]
     track: Option<PathBuf>,
-    #[command(flatten)]
-    clocks: track::ClockArgs,
-    /// Photos with poses from which the scene was trained
-    #[arg(long, value_name = "DATASET")]
-    capture: Option<PathBuf>,
     /// Point on the floor; give at least three
     ///
     /// The first becomes the origin. The second defines the x axis.
-    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true, requires_all = ["above", "length"])]
+    #[arg(long, help_heading = "Scale and frame", value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true, requires_all = ["above", "length"])]
     floor: Vec<DVec3>,
     /// Point above the floor
-    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true)]
+    #[arg(long, help_heading = "Scale and frame", value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true)]
     above: Option<DVec3>,
     /// Two points, and their distance in the room [m]
-    #[arg(long, value_name = "P:P=METRES", value_parser = length, allow_hyphen_values = true)]
+    #[arg(long, help_heading = "Scale and frame", value_name = "P:P=METRES", value_parser = length, allow_hyphen_values = true)]
     length: Option<([DVec3; 2], f64)>,
     /// Standard deviation of picked points or surveyed tags [mm]
-    #[arg(long, value_name = "MM", default_value_t = 5.0)]
+    #[arg(long, help_heading = "Scale and frame", value_name = "MM", default_value_t = 5.0)]
     sigma_mm: f64,
     /// Maximum position error of the twin within the fence [m]
-    #[arg(long, value_name = "METRES", default_value_t = 0.1)]
+    #[arg(long, help_heading = "Scale and frame", value_name = "METRES", default_value_t = 0.1)]
     allow_m: f64,
-    /// Write the alignment even if it is too uncertain
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    clocks: track::ClockArgs,
     /// Open the page, as without any method
-    #[arg(long)]
+    #[arg(long, help_heading = "Web page")]
     page: bool,
     /// Address of the page; port 0 selects a free one
-    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
+    #[arg(long, help_heading = "Web page", value_name = "ADDR", default_value = "127.0.0.1:0")]
     http: SocketAddr,
     /// Renderer of the page's images
-    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    #[arg(long, help_heading = "Web page", value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
     /// Only print the page's address
-    #[arg(long)]
+    #[arg(long, help_heading = "Web page")]
     no_browser: bool,
+    /// Write the alignment even if it is too uncertain
+    #[arg(long, help_heading = "Output")]
+    force: bool,
 }
 
 /// Runs `vizflyt scene align`.

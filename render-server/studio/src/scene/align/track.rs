@@ -19,21 +19,27 @@ pub(in crate::scene) struct ClockArgs {
     /// Times of the images: lines of name,stamp_ns
     ///
     /// [default: stamps.csv of the capture, or the names of the images]
-    #[arg(long, value_name = "CSV", requires = "track")]
+    #[arg(long, help_heading = "Track", value_name = "CSV", requires = "track")]
     times: Option<PathBuf>,
     /// Frame rate, if file names are frame numbers [Hz]
-    #[arg(long, value_name = "HZ", requires = "track", conflicts_with = "times")]
+    #[arg(
+        long,
+        help_heading = "Track",
+        value_name = "HZ",
+        requires = "track",
+        conflicts_with = "times"
+    )]
     rate: Option<f64>,
     /// Maximum offset between the two clocks
     ///
     /// [default: 2, or 30 if their first times are far apart]
-    #[arg(long, value_name = "SECONDS", requires = "track")]
+    #[arg(long, help_heading = "Track", value_name = "SECONDS", requires = "track")]
     max_offset_s: Option<f64>,
     /// Position of the tracked marker relative to the lens (right, down, forward) [m]
     ///
     /// [default: estimated]
     #[arg(
-        long,
+        long, help_heading = "Track",
         value_name = "X,Y,Z",
         requires = "track",
         value_parser = super::point,
@@ -41,7 +47,14 @@ pub(in crate::scene) struct ClockArgs {
     )]
     tracked_at: Option<DVec3>,
     /// Vertical axis of the track: z, or y for Motive's default export
-    #[arg(long, value_enum, value_name = "AXIS", requires = "track", default_value_t)]
+    #[arg(
+        long,
+        help_heading = "Track",
+        value_enum,
+        value_name = "AXIS",
+        requires = "track",
+        default_value_t
+    )]
     track_up: TrackUp,
 }
 

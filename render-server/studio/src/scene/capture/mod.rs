@@ -65,59 +65,59 @@ Examples:
 pub(crate) struct CaptureArgs {
     /// Video, or folder of photos of one camera
     input: PathBuf,
-    /// Output folder; created if missing, an interrupted capture is resumed
-    #[arg(short, long, value_name = "DIR")]
-    output: PathBuf,
+    /// Number of pictures from a video [default: 3 per second, from 80 to 300]
+    #[arg(long, help_heading = "Photos", value_name = "N", value_parser = clap::value_parser!(u16).range(8..=2000))]
+    frames: Option<u16>,
+    /// Maximum width of pictures; wider ones of a video are downscaled [px]
+    #[arg(long, help_heading = "Photos", value_name = "PX", default_value_t = 1920, value_parser = clap::value_parser!(u32).range(160..=8192))]
+    picture_width: u32,
+    /// Lens file of `vizflyt tags calibrate` [default: estimated from the pictures]
+    #[arg(long, help_heading = "Photos", value_name = "CAMERA")]
+    camera: Option<PathBuf>,
+    /// Existing poses of the photos in INPUT: a folder of COLMAP
+    #[arg(long, help_heading = "Photos", value_name = "DATASET")]
+    poses: Option<PathBuf>,
+    /// Python interpreter with pycolmap
+    #[arg(long, help_heading = "Photos", value_name = "PROGRAM", conflicts_with = "poses")]
+    python: Option<PathBuf>,
     /// Surveyed layout of printed tags in the room (`vizflyt tags print`)
-    #[arg(long, value_name = "LAYOUT", conflicts_with_all = ["tag_size", "length"])]
+    #[arg(long, help_heading = "Scale and frame", value_name = "LAYOUT", conflicts_with_all = ["tag_size", "length"])]
     tags: Option<PathBuf>,
     /// Edge of the black square of all tags, if their positions are unknown [m]
-    #[arg(long, value_name = "METRES", value_parser = metres)]
+    #[arg(long, help_heading = "Scale and frame", value_name = "METRES", value_parser = metres)]
     tag_size: Option<f64>,
     /// Numbers of two tags, and the distance between their centres [m]
-    #[arg(long, value_name = "A,B=METRES", value_parser = length)]
+    #[arg(long, help_heading = "Scale and frame", value_name = "A,B=METRES", value_parser = length)]
     length: Option<Length>,
     /// Motion capture track of a marker fixed to the camera during the capture
     ///
     /// Defines scale, vertical axis and frame of the room.
-    #[arg(long, value_name = "CSV", conflicts_with_all = ["tags", "tag_size", "length"])]
+    #[arg(long, help_heading = "Scale and frame", value_name = "CSV", conflicts_with_all = ["tags", "tag_size", "length"])]
     track: Option<PathBuf>,
     #[command(flatten)]
     clocks: ClockArgs,
-    /// Lens file of `vizflyt tags calibrate` [default: estimated from the pictures]
-    #[arg(long, value_name = "CAMERA")]
-    camera: Option<PathBuf>,
-    /// Existing poses of the photos in INPUT: a folder of COLMAP
-    #[arg(long, value_name = "DATASET")]
-    poses: Option<PathBuf>,
-    /// Python interpreter with pycolmap
-    #[arg(long, value_name = "PROGRAM", conflicts_with = "poses")]
-    python: Option<PathBuf>,
-    /// Number of pictures from a video [default: 3 per second, from 80 to 300]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(8..=2000))]
-    frames: Option<u16>,
-    /// Maximum width of pictures; wider ones of a video are downscaled [px]
-    #[arg(long, value_name = "PX", default_value_t = 1920, value_parser = clap::value_parser!(u32).range(160..=8192))]
-    picture_width: u32,
     /// Number of training steps
-    #[arg(long, default_value_t = 3000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(long, help_heading = "Training", default_value_t = 3000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     steps: u32,
     /// Maximum number of splats
-    #[arg(long, default_value_t = 60_000, value_name = "N", value_parser = clap::value_parser!(u32).range(1000..=20_000_000))]
+    #[arg(long, help_heading = "Training", default_value_t = 60_000, value_name = "N", value_parser = clap::value_parser!(u32).range(1000..=20_000_000))]
     splats: u32,
     /// Width of the pictures for training [px]
-    #[arg(long, default_value_t = 320, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
+    #[arg(long, help_heading = "Training", default_value_t = 320, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     width: u32,
     /// Random seed
     ///
     /// The same pictures, poses and seed give the same twin on the same kind of processor.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, help_heading = "Training", default_value_t = 1)]
     seed: u64,
+    /// Output folder; created if missing, an interrupted capture is resumed
+    #[arg(short, long, help_heading = "Output", value_name = "DIR")]
+    output: PathBuf,
     /// Re-run from this stage even if its inputs are unchanged
-    #[arg(long, value_name = "STAGE")]
+    #[arg(long, help_heading = "Output", value_name = "STAGE")]
     from: Option<Stage>,
     /// Train and write an arena.toml even if the capture is rejected
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     force: bool,
 }
 

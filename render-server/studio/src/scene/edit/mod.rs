@@ -43,42 +43,55 @@ pub(crate) struct EditArgs {
     /// Edited scene file [default: NAME.edited.* next to the original]
     ///
     /// The name determines the format.
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, help_heading = "Output", value_name = "FILE")]
     output: Option<PathBuf>,
     /// Print the list of steps
-    #[arg(long, conflicts_with_all = ["undo", "apply", "page", "output"])]
+    #[arg(long, help_heading = "History", conflicts_with_all = ["undo", "apply", "page", "output"])]
     list: bool,
     /// Undo the last N steps
-    #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "1", conflicts_with_all = ["apply", "page"])]
+    #[arg(long, help_heading = "History", value_name = "N", num_args = 0..=1, default_missing_value = "1", conflicts_with_all = ["apply", "page"])]
     undo: Option<usize>,
     /// Write the edited scene again, from the original and the list of steps
-    #[arg(long)]
+    #[arg(long, help_heading = "History")]
     apply: bool,
     /// Open a page to select splats with lasso and box, to delete or name them
-    #[arg(long)]
+    #[arg(long, help_heading = "Web page")]
     page: bool,
     /// Address of the page; port 0 selects a free one
-    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0", requires = "page")]
+    #[arg(
+        long,
+        help_heading = "Web page",
+        value_name = "ADDR",
+        default_value = "127.0.0.1:0",
+        requires = "page"
+    )]
     http: SocketAddr,
     /// Renderer of the page's images
-    #[arg(long, value_enum, value_name = "KIND", default_value_t, requires = "page")]
+    #[arg(
+        long,
+        help_heading = "Web page",
+        value_enum,
+        value_name = "KIND",
+        default_value_t,
+        requires = "page"
+    )]
     renderer: RendererKind,
     /// Only print the page's address
-    #[arg(long, requires = "page")]
+    #[arg(long, help_heading = "Web page", requires = "page")]
     no_browser: bool,
     #[command(flatten)]
     steps: Requests,
     /// Minimum width of --carve's free space around the path [default: 2 cells]
-    #[arg(long, value_name = "LENGTH", requires = "carve")]
+    #[arg(long, help_heading = "Details of --carve", value_name = "LENGTH", requires = "carve")]
     carve_radius: Option<f64>,
     /// Thickness of walls that --carve keeps behind their face [default: 3 cells]
-    #[arg(long, value_name = "LENGTH", requires = "carve")]
+    #[arg(long, help_heading = "Details of --carve", value_name = "LENGTH", requires = "carve")]
     carve_depth: Option<f64>,
     /// Edge length of --carve's cells [default: 1/30 of the core's shortest side]
-    #[arg(long, value_name = "LENGTH", requires = "carve")]
+    #[arg(long, help_heading = "Details of --carve", value_name = "LENGTH", requires = "carve")]
     carve_cell: Option<f64>,
     /// Maximum viewing distance of --carve [default: the core's longest side]
-    #[arg(long, value_name = "LENGTH", requires = "carve")]
+    #[arg(long, help_heading = "Details of --carve", value_name = "LENGTH", requires = "carve")]
     carve_reach: Option<f64>,
 }
 
