@@ -1,6 +1,6 @@
 """Flies every check against one autopilot; see `run`.
 
-Checks: pilot (whose word counts), net (the fence holds), failsafe (what is lost), station (a second system 255).
+Checks: pilot (pilot's override), net (the fence holds), failsafe (losses in flight), station (a second system 255).
 """
 
 import argparse
@@ -38,7 +38,7 @@ def arguments():
     for name in given.only.split(","):
         if name not in CHECKS:
             parser.error(f"there is no check '{name}'; there are {', '.join(CHECKS)}")
-    # Of a PX4 nothing is flown, so that nothing of ours is needed.
+    # PX4 is not flown, so this project's programs are not needed.
     for file in (given.binary, *([] if "px4" in given.binary.name else [given.vizflyt, given.plugin])):
         if not file.is_file():
             parser.error(f"there is no {file}; `cargo build --workspace --bins --examples` builds ours")
@@ -46,7 +46,7 @@ def arguments():
 
 
 def counterpart(binary):
-    """What the binary is, by what it says of itself."""
+    """Returns the type of the binary, from its help text."""
     help_text = subprocess.run([binary, "--help"], capture_output=True, text=True, timeout=30).stdout
     for kind, option in ((Simulated, "--truth-to"), (Sitl, "--slave")):
         if option in help_text:
@@ -55,7 +55,7 @@ def counterpart(binary):
 
 
 def main():
-    # Whoever ends this ends what it has started.
+    # SIGTERM also ends the child processes.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))
     given = arguments()
     if "px4" in given.binary.name:

@@ -1,4 +1,4 @@
-"""Counts checks, and waits for what they look at."""
+"""Counts checks, and waits for conditions."""
 
 import contextlib
 import time
@@ -7,7 +7,7 @@ counts = {"ok": 0, "FAIL": 0, "skipped": 0}
 
 
 class Failed(Exception):
-    """A flight did not come to where it would be looked at."""
+    """A flight did not reach the state to be checked."""
 
 
 def say(text):
@@ -27,7 +27,7 @@ def skip(name, why):
 
 @contextlib.contextmanager
 def attempt(name):
-    """Counts a flight that does not come to its point as a failure of this check."""
+    """Counts a flight that does not reach its state as a failure of this check."""
     try:
         yield
     except Failed as why:
@@ -35,7 +35,7 @@ def attempt(name):
 
 
 def wait(what, done, within_s):
-    """Returns what `done` does, once it is true."""
+    """Returns the value of `done` as soon as it is true."""
     end = time.monotonic() + within_s
     while not (seen := done()):
         if time.monotonic() > end:

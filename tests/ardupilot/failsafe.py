@@ -1,4 +1,4 @@
-"""What is lost in flight, at three speeds: how soon it lands, is down, and how far it drifts by then."""
+"""Losses in flight at three speeds: time until LAND, time until landed, and drift until then."""
 
 import pathlib
 import re
@@ -14,9 +14,9 @@ from poses import level_m
 SPEEDS_MPS = (0.35, 1.0, 2.5)
 LAND = 9
 DOWN_M = 0.05
-# Until the speed is flown; where it is not reached in this way, it is struck there. [m]
+# Maximum run-up to reach the speed; the loss happens here even if the speed is not reached. [m]
 RUN_UP_M = 4.5
-# Nothing takes as long. [s]
+# Maximum time of observation. [s]
 WATCHED_S = 25.0
 DOCUMENT = pathlib.Path(__file__).parents[2] / "docs/guides/failsafe.md"
 
@@ -106,7 +106,7 @@ def judge(row):
 
 
 def written(name, speed_mps):
-    """The document's last three cells of a row."""
+    """Returns the last three cells of the row in docs/guides/failsafe.md."""
     cells = rf"\| {re.escape(name)} \|[^|]*\| {speed_mps:g} m/s \|.*\| ([^|]+) \| ([^|]+) \| ([^|]+) \|"
     row = re.search(rf"(?m)^{cells}$", DOCUMENT.read_text())
     if not row:

@@ -1,4 +1,4 @@
-"""A flight: the render server and the runtime as they are, around a vehicle that somebody else made."""
+"""A flight: the real render server and runtime, with a vehicle from another project."""
 
 import contextlib
 import json
@@ -14,13 +14,13 @@ from checks import Failed, say, wait
 from poses import Poses
 from wire import Station, Wire
 
-# Longer than anything takes on a loaded machine. [s]
+# Timeout of any step on a loaded machine. [s]
 PATIENCE_S = 90
 SPAWN = (0.9, 0.0, 0.0)
 
 
 class Program:
-    """A child that prints JSON lines."""
+    """A child process that prints JSON lines."""
 
     def __init__(self, log, arguments):
         self.lines, self.log = [], log
@@ -51,18 +51,18 @@ class Program:
         self.process.send_signal(number)
 
     def close(self):
-        # With whatever it has left behind.
+        # Including its remaining child processes.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
 
 
 class Lab:
-    """What flights share: a scene, keys of server and runtime, a vehicle that is set up."""
+    """Shared setup of all flights: a scene, keys of server and runtime, a configured vehicle."""
 
     def __init__(self, folder, vizflyt, plugin, vehicle):
         self.folder, self.vizflyt, self.plugin, self.vehicle = pathlib.Path(folder), vizflyt, plugin, vehicle
-        # The plugin runs as another user where this is root.
+        # As root, the plugin runs as another user, who needs access to the folder.
         self.folder.chmod(0o755)
         subprocess.run([vizflyt, "scene", "generate", "room", "--force", "-o", self.folder / "room"], check=True,
                        stdout=subprocess.DEVNULL)
@@ -76,7 +76,7 @@ class Lab:
         server.close()
 
     def arena(self, spawn, yaw_deg=0):
-        """Writes it for a flight from there: small images, and a goal out of the way."""
+        """Writes the arena for a flight from `spawn`: small images, and a goal off the path."""
         values = {
             "width_px": 96, "height_px": 72,
             "position_m": [[*spawn], [0.5, 2.0, 3.2], None], "yaw_deg": yaw_deg, "radius_m": 0.01,
@@ -86,7 +86,7 @@ class Lab:
         text = self.plain
         for key, value in values.items():
             each = iter(value if isinstance(value, list) else [value])
-            # Of a key that comes several times, the values in their order; none leaves what is there.
+            # For a key that occurs several times: its values in order; None keeps the existing value.
             text = re.sub(rf"(?m)^{key} = .*$",
                           lambda m: m[0] if (new := next(each, None)) is None else f"{key} = {new}", text)
         (self.folder / "room/arena.toml").write_text(text)
@@ -101,13 +101,13 @@ class Lab:
 
 
 class Flight:
-    """One flight of the plugin that does `how`."""
+    """One flight with the plugin in its mode `how`."""
 
     def __init__(self, lab, how, spawn=SPAWN, system=254):
         self.spawn = spawn
         self.fence = lab.arena(spawn)
         self.poses, self.wire = Poses(), Wire()
-        # An autopilot passes on, from port to port, what a station says; the simulator does not.
+        # An autopilot forwards a station's messages between its ports; the simulator does not.
         self.station = Station(system, None if lab.vehicle.is_real else self.wire.tell_runtime)
         self.vehicle = lab.vehicle.start(self.poses, self.wire, self.station, spawn, 0)
         self.server = lab.serve(0)
@@ -131,7 +131,7 @@ class Flight:
             part.close()
 
     def until(self, what, done, within_s=PATIENCE_S):
-        """Waits for it, as long as the runtime has not given up."""
+        """Waits for a condition while the runtime runs."""
         seen = lambda: done() or self.runtime.process.poll() is not None
         wait(what, seen, within_s)
         if not done():
@@ -144,6 +144,6 @@ class Flight:
         return self.runtime.has(f'"phase": "{name}"}}')
 
     def said(self):
-        """What the runtime has said of itself last."""
+        """Returns the runtime's latest event."""
         events = [line["event"]["text"] for _, line in list(self.runtime.lines) if "event" in line]
         return "; ".join(events[-3:]) or "nothing"

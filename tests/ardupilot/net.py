@@ -1,20 +1,20 @@
-"""Inside the net: whatever the plugin asks, the true body does not leave the fence."""
+"""Inside the net: the true body stays inside the fence for every command of the plugin."""
 
 from checks import attempt, check
 from lab import Flight
 from promises import OUTSIDE_M
 
-# Half a metre more than the arena allows, so that the guard's limits are what is flown. [m/s]
+# Half a metre per second above the arena's limit, so that the guard's limit applies. [m/s]
 ASKED_MPS = 3.0
 BODY_RADIUS_M = 0.12
-# Each face: its name, its axis, which way, and a start from where the way is long.
+# Each face: its name, its axis, the direction, and a start with a long run-up.
 FACES = {
     "east": (0, 1, (0.9, 0.0, 0.0)),
     "west": (0, -1, (10.1, 0.0, 0.0)),
     "north": (1, 1, (5.0, -1.6, 0.0)),
     "south": (1, -1, (5.0, 1.6, 0.0)),
 }
-# Until it stands before the face, or hangs in it. [s]
+# Time until the vehicle stops before the face, or hangs in the net. [s]
 WATCHED_S = 14.0
 STANDS_MPS = 0.05
 
@@ -35,7 +35,7 @@ def fly(lab, name, axis, sign, spawn):
         stands = lambda: moved() and flight.poses.speed_mps() < STANDS_MPS
         over = lambda: flight.poses.now().stamp_s > start + WATCHED_S
         flight.until("the vehicle before the face", lambda: stands() or over() or flight.phase("landed"), 60)
-        # It may swing back and come again.
+        # It may swing back and return.
         stood = flight.poses.now().stamp_s
         flight.until("a while there", lambda: flight.poses.now().stamp_s > stood + 2.0 or flight.phase("landed"), 30)
         track = flight.poses.since(start)

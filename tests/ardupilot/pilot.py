@@ -1,4 +1,5 @@
-"""The pilot's word: once a mode of the runtime's was confirmed, any other means hands off, in every phase."""
+"""Pilot override: as soon as a mode set by the runtime was confirmed, any other mode means hands off, in every
+phase."""
 
 import time
 
@@ -9,16 +10,16 @@ from promises import HANDS_OFF_S
 MODES = {"ALT_HOLD": 2, "LOITER": 5, "BRAKE": 17, "LAND": 9, "STABILIZE": 0, "RTL": 6}
 GUIDED, LAND = 4, 9
 PHASES = ("take-off", "flight", "landing")
-# In the climb, and in the landing while there is still something to take over. [m]
+# Heights in the climb, and in the landing while a takeover is still possible. [m]
 CLIMBED_M, LOW_M = 0.3, 0.9
-# For so long a vehicle has, to take a mode. [s]
+# Time limit for the vehicle to change its mode. [s]
 TAKES_S = 3.0
 
 
 def cases():
     for phase in PHASES:
         for mode in MODES:
-            # LAND while it lands is no other mode.
+            # LAND during the landing is not a different mode.
             if (phase, mode) != ("landing", "LAND"):
                 yield phase, mode
 
@@ -38,7 +39,7 @@ def fly(lab, source, phase, mode):
     name = f"hands off after {mode} by {source} in {phase}"
     with attempt(name), Flight(lab, "late-land" if phase == "landing" else "forward") as flight:
         if source == "RC":
-            # The switch stands elsewhere before, on a mode that does not count until it is turned.
+            # Before that, the switch is at another mode, which does not count until the switch moves.
             flight.vehicle.switch("ALT_HOLD" if mode == "STABILIZE" else "STABILIZE")
         come_to(flight, phase)
         number, told = MODES[mode], time.monotonic()
@@ -46,7 +47,7 @@ def fly(lab, source, phase, mode):
             flight.vehicle.switch(mode)
         else:
             flight.station.set_mode(number)
-        # What the vehicle reports at first, before the runtime may have overruled it.
+        # The first mode that the vehicle reports, before the runtime may have overridden it.
         taken = lambda: next((b for b in flight.wire.beats if b.at > told and b.mode == number), None)
         end = time.monotonic() + TAKES_S
         while not taken() and time.monotonic() < end:
@@ -69,7 +70,7 @@ def fly(lab, source, phase, mode):
 
 
 def come_to(flight, phase):
-    """Flies until a pilot shall speak; our own mode was confirmed by then."""
+    """Flies to the phase of the takeover; the runtime's own mode was confirmed by then."""
     flight.until("GUIDED", lambda: flight.wire.mode() == GUIDED)
     if phase == "take-off":
         flight.until("the climb", lambda: flight.height_m() > CLIMBED_M)

@@ -1,6 +1,6 @@
-"""The motion capture: takes where the vehicle truly is, notes it, and hands it on as measured poses.
+"""The motion capture: receives the vehicle's true positions, records them, and sends them on as measured poses.
 
-The truth comes as the JSON packets that `vizflyt serve` reads poses from, at any rate; at most 100 a second are handed
+The truth arrives as the JSON packets that `vizflyt serve` reads poses from, at any rate; at most 100 a second are sent
 on, each with noise of half a millimetre.
 """
 
@@ -21,9 +21,9 @@ UNSTEADY_S = 0.1
 
 
 class Sight(NamedTuple):
-    at: float  # when it came, on our clock [s]
-    stamp_s: float  # when it was true, on the vehicle's clock [s]
-    p: tuple  # where the body was [m, world]
+    at: float # time of receipt, on this computer's clock [s]
+    stamp_s: float # time of the position, on the vehicle's clock [s]
+    p: tuple # position of the body [m, world]
 
 
 class Poses(threading.Thread):
@@ -62,15 +62,16 @@ class Poses(threading.Thread):
         return self.track[bisect.bisect_left(self.track, stamp_s, key=lambda sight: sight.stamp_s) :]
 
     def stamp_s(self, at):
-        """The vehicle's time when it was `at` here."""
+        """Returns the vehicle's time at the local time `at`. [s]"""
         index = bisect.bisect_left(self.track, at, key=lambda sight: sight.at)
         return self.track[min(index, len(self.track) - 1)].stamp_s
 
     def unsteady(self):
-        """How the vehicle's clock ran, if not evenly: then figures are a busy machine's."""
+        """Returns how unevenly the vehicle's clock ran, if it did: then the machine was overloaded and the figures do
+        not count."""
         if len(self.track) < RATE_HZ:
             return ""
-        # The first second belongs to the start.
+        # Skip the first second, the start.
         track = self.track[RATE_HZ:]
         gap_s = max((b.at - a.at for a, b in itertools.pairwise(track)), default=0.0)
         ratio = (track[-1].stamp_s - track[0].stamp_s) / max(track[-1].at - track[0].at, 1e-3)
@@ -80,7 +81,7 @@ class Poses(threading.Thread):
         return note % (gap_s * 1e3, ratio)
 
     def speed_mps(self):
-        """Along the ground, over the last tenth of a second."""
+        """Returns the horizontal speed over the last tenth of a second. [m/s]"""
         if len(self.track) <= RATE_HZ // 10:
             return 0.0
         before, now = self.track[-1 - RATE_HZ // 10], self.track[-1]

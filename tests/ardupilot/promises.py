@@ -1,22 +1,22 @@
-"""What a vehicle promises, in figures. The one place to change them; docs/guides says the same in words."""
+"""Guaranteed limits of a vehicle. Change them only here; docs/guides describes them in words."""
 
-# After a loss that something beside the autopilot answers: down within so long, having drifted by so far. [s], [m]
+# After a loss that a component other than the autopilot handles: maximum time to landing, maximum drift. [s], [m]
 DOWN_WITHIN_S = 5.0
 DRIFT_M = 0.5
-# And by so long a way at the speed that was flown. [s]
+# And in addition to the drift, this time multiplied by the speed of flight. [s]
 DRIFT_S = 0.8
 
-# Losses that only the autopilot is left to answer: down as rows of docs/guides/failsafe.md say, or so much later. [s]
+# Losses that only the autopilot can handle: time to landing as in docs/guides/failsafe.md, plus a tolerance. [s]
 AUTOPILOT_ALONE = {"MAVLink cut": "Wi-Fi dies"}
 AS_WRITTEN_S = 1.0
 
-# How far the body may be outside the fence. [m]
+# Maximum distance of the body outside the fence. [m]
 OUTSIDE_M = 0.0
 
-# For so long after a pilot's word the runtime is listened to. [s]
+# Time after a pilot's override in which the runtime's commands are recorded. [s]
 HANDS_OFF_S = 4.0
 
-# For so long a vehicle that must not arm is watched. [s]
+# Time for which a vehicle that must not arm is observed. [s]
 DISARMED_S = 6.0
 
 

@@ -1,4 +1,4 @@
-"""Our own simulator in the autopilot's place: to try the checks themselves, and to see where it differs."""
+"""This project's simulator in place of the autopilot: tests the checks themselves, and shows differences."""
 
 import json
 import subprocess
@@ -9,7 +9,7 @@ from wire import Station
 
 
 class Simulated:
-    """The simulator, once per flight."""
+    """The simulator, started once for each flight."""
 
     is_real = False
 
@@ -18,7 +18,8 @@ class Simulated:
         self.parameters = []
 
     def prepare(self, arena):
-        """The doctor sets it up, too; as it forgets with each end, every flight begins with what it had then."""
+        """Configures it with the doctor too; it loses its parameters at its end, so every flight starts with the same
+        ones."""
         station = Station()
         with RunningSimulator(self, [f"--mavlink=udpout:{station.address}", "--mavlink=tcpin:127.0.0.1:0"]) as running:
             wait("the simulator's heartbeat", lambda: "HEARTBEAT" in station.newest, 30)
@@ -51,7 +52,7 @@ class RunningSimulator:
         self.close()
 
     def lift(self):
-        """Nobody holds its sticks."""
+        """Does nothing: the simulator has no transmitter."""
 
     def close(self):
         self.process.kill()

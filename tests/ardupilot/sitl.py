@@ -1,5 +1,5 @@
-"""ArduCopter in SITL as the vehicle: set up by `vizflyt doctor vehicle --apply`, with its truth, its transmitter and
-its telemetry ports."""
+"""ArduCopter in SITL as the vehicle: configured by `vizflyt doctor vehicle --apply`, with its true state, its
+transmitter and its telemetry ports."""
 
 import contextlib
 import pathlib
@@ -17,7 +17,8 @@ from wire import Station
 HERE = pathlib.Path(__file__).parent
 AIRFRAME = HERE.parents[1] / "hardware/airframe"
 
-# What no airframe file can hold: this one has other outputs, motors and a smaller battery, and was never calibrated.
+# Parameters that cannot be in an airframe file: SITL has other outputs, motors and a smaller battery, and is
+# uncalibrated.
 OVERRIDES = {
     "SERVO1_FUNCTION": 33, "SERVO2_FUNCTION": 34, "SERVO3_FUNCTION": 35, "SERVO4_FUNCTION": 36,
     "SERVO9_FUNCTION": 0, "SERVO10_FUNCTION": 0, "SERVO11_FUNCTION": 0, "SERVO12_FUNCTION": 0,
@@ -27,29 +28,30 @@ OVERRIDES = {
 }
 CALIBRATED = {f"INS_ACC{n}{what}_{axis}": value
               for n in ("", 2) for what, value in (("OFFS", 0.001), ("SCAL", 1.001)) for axis in "XYZ"}
-# The pilot's switch, by PWM, which the airframe file leaves free at three of its places.
+# The pilot's switch, by PWM; the airframe file leaves three of its positions free.
 SWITCH = {"FLTMODE2": 5, "FLTMODE3": 17, "FLTMODE5": 6}
 PWM = {"STABILIZE": 1100, "LOITER": 1295, "BRAKE": 1425, "ALT_HOLD": 1555, "RTL": 1685, "LAND": 1900}
 
 PLACE = "42.3,-71.8,100"
 BOOT_S = 60
-# What SITL adds to the port of a TCP link.
+# Offset that SITL adds to the port of a TCP link.
 BASE_PORT = 5760
 
 
 def doctor(vizflyt, address, folder, *more):
-    """Sets an autopilot up as a person does, by the project's own airframe file."""
+    """Configures an autopilot as a user does, with the project's airframe file."""
     command = [vizflyt, "doctor", "vehicle", "--mavlink", address, "--apply", *more]
     done = subprocess.run(command, text=True, capture_output=True, timeout=120)
     with open(folder / "doctor.log", "a") as log:
         log.write(done.stdout + done.stderr)
-    # Its status is 1 where something was dangerous, also if it mended that.
+    # The status is 1 if a setting was dangerous, even if the doctor corrected it.
     if done.returncode not in (0, 1) or "parameters" not in done.stdout:
         raise Failed("the doctor gave up: %s" % (done.stdout + done.stderr)[-500:])
 
 
 class Transmitter(threading.Thread):
-    """The pilot's: throttle down until it is lifted, channel 5 as the switch stands, channel 6 lets the motors turn."""
+    """The pilot's transmitter: throttle down until lifted, channel 5 is the mode switch, channel 6 enables the
+    motors."""
 
     def __init__(self, port):
         super().__init__(daemon=True)
@@ -68,7 +70,7 @@ class Transmitter(threading.Thread):
 
 
 class Sitl:
-    """The program, once per flight, in a folder of its own."""
+    """The program, started once for each flight in its own folder."""
 
     is_real = True
 
@@ -78,9 +80,9 @@ class Sitl:
         self.eeprom = folder / "eeprom.bin"
 
     def prepare(self, arena):
-        """Sets the vehicle up as a person does, and restarts it: what it holds then begins every flight."""
+        """Configures the vehicle as a user does, and restarts it: every flight starts with these parameters."""
         (self.folder / "calibrated.param").write_text("".join(f"{n},{v}\n" for n, v in CALIBRATED.items()))
-        # A group of parameters is there once what switches it on has been, and the vehicle was restarted.
+        # A group of parameters appears only after its enabling parameter is set and the vehicle was restarted.
         self.session(lambda port, _: doctor(self.vizflyt, f"tcpout:127.0.0.1:{port}", self.folder))
         self.session(lambda port, station: self.finish(f"tcpout:127.0.0.1:{port}", arena, station))
 
@@ -94,12 +96,12 @@ class Sitl:
                 say("note  this ArduCopter has no %s" % name)
 
     def session(self, work):
-        """Lets somebody work on it, and keeps its parameters."""
+        """Runs `work` on a running vehicle, and saves its parameters."""
         station, port = Station(), BASE_PORT + 230
         with Running(self, "prepare", station, f"tcp:{port - BASE_PORT}") as running:
             wait("ArduCopter's heartbeat", lambda: "HEARTBEAT" in station.newest, BOOT_S)
             work(port, station)
-            # It writes them in the background.
+            # SITL writes the parameters in the background.
             time.sleep(2)
             shutil.copy(running.folder / "eeprom.bin", self.eeprom)
         station.close()
@@ -109,7 +111,7 @@ class Sitl:
 
 
 class Running:
-    """SITL while it runs; closes with all that belongs to it."""
+    """A running SITL; closes with all its child processes."""
 
     def __init__(self, sitl, name, station, jetson, poses=None, spawn=(0, 0, 0), yaw_deg=0):
         self.folder = sitl.folder / name
@@ -122,7 +124,7 @@ class Running:
             [sys.executable, HERE / "slave.py", poses.address, "%g,%g,%g" % spawn], stdin=subprocess.PIPE)
         radio = free_port()
         self.transmitter = Transmitter(radio)
-        # TELEM2 is the Jetson's, TELEM1 a ground station's. SERIAL0 waits for a client unless it is given.
+        # TELEM2 is the Jetson's, TELEM1 a ground station's. SERIAL0 waits for a client unless it is configured.
         arguments = [
             "--model", "x", "--speedup", "1", "--home", f"{PLACE},{90 - yaw_deg:g}",
             "--defaults", sitl.folder / "calibrated.param", "--rc-in-port", str(radio),

@@ -1,11 +1,11 @@
-"""Asks an ArduCopter in SITL where its vehicle truly is, and sends that on.
+"""Reads the true position of the vehicle from an ArduCopter in SITL, and sends it on.
 
-With `--slave 1` SITL shows every turn of its physics to another program, as JSON, and waits for an answer: that is
-meant for a second flight controller riding along, whose outputs nobody uses. So this one answers at once, and the
-positions come to the last bit, with the time they are of; what SITL says by MAVLink is cut to centimetres. A process
-of its own, as SITL waits for it.
+With `--slave 1` SITL sends the state of each physics step to another program as JSON, and waits for an answer: this
+interface is meant for a second flight controller, whose outputs SITL ignores. This program answers at once, and so gets
+positions at full precision with their times; positions by MAVLink are rounded to centimetres. It is a separate process,
+because SITL waits for it.
 
-Usage: slave.py OUT X,Y,Z    OUT is where poses go, as JSON packets; X,Y,Z where the vehicle starts [m, world]
+Usage: slave.py OUT X,Y,Z    OUT is the destination of the poses, as JSON packets; X,Y,Z the vehicle's start [m, world]
 """
 
 import json
@@ -15,19 +15,20 @@ import socket
 import struct
 import sys
 
-# Where SITL takes its first slave's outputs; fixed in it, so that one SITL runs at a time.
+# Port on which SITL receives its first slave's outputs; fixed in SITL, so that only one SITL can run at a time.
 PORT = 9012
 # Magic, frame rate, frame count, 16 outputs.
 ANSWER = struct.Struct("<HHI16H")
 MAGIC = 18458
 PERIOD_NS = 5_000_000
-# Answers under way ahead of it, so that SITL does not wait for this process to be scheduled.
+# Number of answers sent ahead, so that SITL does not wait until this process is scheduled.
 AHEAD = 100
 HALF = math.sqrt(0.5)
 
 
 def body_to_world(w, x, y, z):
-    """A quaternion from forward-right-down in north-east-down, wxyz, to forward-left-up in east-north-up, xyzw."""
+    """Converts a quaternion from forward-right-down in north-east-down, wxyz, to forward-left-up in east-north-up,
+    xyzw."""
     w, x, y, z = -x, w, z, -y
     return HALF * (w + z), HALF * (w - z), HALF * (y - x), -HALF * (x + y)
 
@@ -49,13 +50,13 @@ def main():
 
     while True:
         ready = select.select([sitl, parent], [], [], 0.1)[0]
-        # Standard input closes with the parent.
+        # Standard input closes when the parent ends.
         if parent in ready:
             return
         try:
             data = sitl.recv(2048)
         except BlockingIOError:
-            # SITL has not begun, or has lost count: once more.
+            # SITL has not started, or has lost count: send the answer again.
             answer()
             continue
         except ConnectionError:

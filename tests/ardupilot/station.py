@@ -1,4 +1,4 @@
-"""A second station whose system is 255 would hide from the autopilot that the runtime is gone: nothing is armed."""
+"""A second station with system id 255 would hide the loss of the runtime from the autopilot: arming is refused."""
 
 from checks import attempt, check
 from lab import Flight
@@ -10,7 +10,7 @@ def run(lab, _quick):
     with attempt(name), Flight(lab, "forward", system=255) as flight:
         why = lambda: flight.runtime.has("255")
         flight.until("the runtime's sentence, or the climb", lambda: why() or flight.wire.armed())
-        # It is ready for all else by then: the autopilot, its poses and images.
+        # By then the rest is ready: the autopilot, its poses and images.
         start = flight.poses.now().stamp_s
         flight.until("a while on the ground",
                      lambda: flight.poses.now().stamp_s > start + DISARMED_S or flight.wire.armed())

@@ -1,4 +1,4 @@
-"""MAVLink between the vehicle and the runtime, which passes here and can be cut; and a ground station beside it."""
+"""MAVLink between vehicle and runtime, forwarded here so that it can be cut; and a parallel ground station."""
 
 import contextlib
 import select
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-# What changes the mode. A runtime whose pilot has the vehicle sends none of them.
+# Commands that change the mode. A runtime sends none of them after the pilot's takeover.
 MODE_COMMANDS = {
     mavlink.MAV_CMD_DO_SET_MODE: "DO_SET_MODE",
     mavlink.MAV_CMD_NAV_LAND: "NAV_LAND",
@@ -30,7 +30,7 @@ class Beat(NamedTuple):
 class Order(NamedTuple):
     at: float  # [s]
     name: str
-    mode: int  # of DO_SET_MODE and SET_MODE
+    mode: int # of DO_SET_MODE and SET_MODE
 
 
 def udp():
@@ -68,7 +68,7 @@ class Wire(threading.Thread):
                 try:
                     data, sender = side.recvfrom(4096)
                 except ConnectionError:
-                    continue  # a runtime that is gone
+                    continue # the runtime has ended
                 is_vehicle = side is self.sides[0]
                 for message in (down if is_vehicle else up).parse_buffer(data) or []:
                     (self.of_vehicle if is_vehicle else self.of_runtime)(message)
@@ -101,7 +101,7 @@ class Wire(threading.Thread):
         return bool(self.beats) and self.beats[-1].armed
 
     def tell_runtime(self, packet):
-        """Hands it what came by the air, but not from the vehicle."""
+        """Sends the runtime a packet as if from the radio, but not from the vehicle."""
         if self.runtime and not self.cut:
             self.sides[1].sendto(packet, self.runtime)
 
@@ -113,7 +113,7 @@ class Wire(threading.Thread):
 
 
 class Station(threading.Thread):
-    """A ground station on a link of its own; `system` is its id, `heard` gets its heartbeats besides."""
+    """A ground station on its own link with the id `system`; `heard` is called for its heartbeats as well."""
 
     def __init__(self, system=254, heard=None):
         super().__init__(daemon=True)
@@ -159,7 +159,7 @@ class Station(threading.Thread):
         self.socket.sendto(message.pack(self.mav), self.vehicle)
 
     def ask(self, done, message, within_s=5.0):
-        """Sends until `done`; returns whether it came to that."""
+        """Sends a message until `done`; returns whether that happened in time."""
         end = time.monotonic() + within_s
         while not done() and time.monotonic() < end:
             self.send(message)
@@ -169,26 +169,26 @@ class Station(threading.Thread):
         return done()
 
     def command(self, number, *params):
-        """Returns the result of its acknowledgement, or none."""
+        """Sends a command; returns the result in its acknowledgement, or None."""
         self.acks.pop(number, None)
         all_seven = [*params, 0, 0, 0, 0, 0, 0, 0][:7]
         self.ask(lambda: number in self.acks, self.mav.command_long_encode(1, 1, number, 0, *all_seven))
         return self.acks.get(number)
 
     def set_mode(self, number):
-        """One order, as a person gives it."""
+        """Sends one command to change the mode, as a person does."""
         mode = mavlink.MAV_CMD_DO_SET_MODE
         self.send(self.mav.command_long_encode(1, 1, mode, 0, 1, number, 0, 0, 0, 0, 0))
 
     def set_parameter(self, name, value):
-        """Returns whether the vehicle has it so now."""
+        """Sets a parameter; returns whether the vehicle confirmed the value."""
         self.parameters.pop(name, None)
         real = mavlink.MAV_PARAM_TYPE_REAL32
         message = self.mav.param_set_encode(1, 1, name.encode(), value, real)
         return self.ask(lambda: abs(self.parameters.get(name, 1e9) - value) < 1e-4, message)
 
     def all_parameters(self):
-        """Every parameter by name."""
+        """Returns all parameters by name."""
         self.send(self.mav.param_request_list_encode(1, 1))
         count, still = -1, time.monotonic()
         while time.monotonic() - still < 1.5:

@@ -1,6 +1,6 @@
-/* A plugin of QEMU's (7.2 and newer, user mode) that prints how many instructions a program has executed.
+/* QEMU plugin (7.2 and newer, user mode) that prints the number of instructions executed by a program.
  *
- * Debian ships no header for plugins: what is used of the interface is declared here, as version 1 has it
+ * Debian has no header for plugins, so the used part of the interface, version 1, is declared here
  * (https://www.qemu.org/docs/master/devel/tcg-plugins.html). */
 
 #include <inttypes.h>
@@ -23,7 +23,7 @@ int qemu_plugin_version = 1;
 
 static uint64_t executed;
 
-/* Threads run side by side. */
+/* Called by several threads in parallel. */
 static void block_executed(unsigned cpu, void *instructions)
 {
     (void)cpu;

@@ -1,4 +1,4 @@
-"""Runs hostile submissions through `vizflyt grade` and `vizflyt fly`, and looks at what they got. See `run`."""
+"""Runs hostile submissions through `vizflyt grade` and `vizflyt fly`, and checks what they obtained. See `run`."""
 
 import json
 import os
@@ -22,7 +22,7 @@ def run(*arguments, **more):
 
 
 def attempts(text):
-    """What the submission said of its attempts."""
+    """Returns the submission's own reports of its attempts."""
     return re.findall(r"attempt ([^\n]+?): (PASSED|refused)([^\n<]*)", text)
 
 
@@ -36,12 +36,12 @@ def check_attempts(where, text, least):
 
 
 class Scene:
-    """A computer with things that are none of a submission's business."""
+    """A computer with files and processes that a submission must not access."""
 
     def __init__(self, folder):
         self.folder = folder
         self.keys = folder / "keys"
-        # Somebody's file in their home, in a folder of their own that anybody may enter.
+        # A file in another user's home, in a folder that every user may enter.
         self.home = pathlib.Path.home() / f".vizflyt-attack-{os.getpid()}"
         self.home.mkdir()
         self.private = self.home / "private"
@@ -64,7 +64,7 @@ class Scene:
             "homes": [str(self.home.parent)], "reports": [str(path) for path in reports], "graded": graded,
         }
         (folder / "targets.json").write_text(json.dumps(targets))
-        # What it may do by the rights of files alone is not what is tried here.
+        # File permissions must allow the access: only the sandbox is tested here.
         for path in (folder, *folder.iterdir()):
             path.chmod(0o777)
         return folder / "submission"
@@ -74,9 +74,9 @@ class Scene:
 
 
 def graded_flights(scene):
-    """Secrets, other processes, what outlives a flight."""
+    """Secrets, other processes, and processes that survive a flight."""
     run("grade", "key", "--keys", scene.keys)
-    # In the submission's own folder, as who grades in continuous integration has it.
+    # In the submission's own folder, as a grader in continuous integration does.
     out = scene.folder / "graded/out"
     report, junit = out / "index.html", scene.folder / "grade.xml"
     program = scene.submission("graded", True, [report, junit])
@@ -107,7 +107,7 @@ def graded_flights(scene):
 
 
 def another_try(scene):
-    """A flight that goes badly, lost on purpose: as if somebody else had killed the plugin."""
+    """A plugin that fails its flight on purpose, as if another process had killed it."""
     program = scene.folder / "another-try"
     program.write_text("#!/usr/bin/python3\nimport os\nos.kill(os.getpid(), 9)\n")
     program.chmod(0o755)
@@ -116,7 +116,7 @@ def another_try(scene):
 
 
 def an_honest_one(scene):
-    """What the cell must not keep from its plugin: itself, by whatever name."""
+    """The sandbox must not hide the plugin's own files, under any of their names."""
     folder = scene.folder / "honest"
     (folder / "vizflyt").mkdir(parents=True)
     (folder / "vizflyt/__init__.py").write_text("run = None\n")
@@ -129,7 +129,7 @@ def an_honest_one(scene):
 
 
 def lab_flight(scene):
-    """The same in the simulated lab, where a person's plugin is less confined."""
+    """The same attacks in the simulated lab, where a person's plugin is less confined."""
     program = scene.submission("lab", False)
     report = scene.folder / "lab.json"
     done = run("fly", program, "--scene", "forest", "--headless", "--seconds", 5, "--ready-within", 20, "--report",
@@ -170,7 +170,7 @@ while True:
 
 
 def more_than_its_share(scene):
-    """Memory and processes beyond the limits, where nobody looks."""
+    """Memory and processes beyond the limits, in an unattended flight."""
     settings = scene.folder / "jetson.toml"
     settings.write_text("[plugin]\nmemory_mb = 200\nprocesses = 32\nrestart = \"never\"\n")
     said = {

@@ -1,4 +1,4 @@
-"""What all attacks share: the program, its checks, and the end."""
+"""Shared by all attacks: the program, the checks, and the final summary."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def end():
 
 
 class Program:
-    """`vizflyt` while it runs, with the JSON lines that it prints."""
+    """A running `vizflyt`, with the JSON lines that it prints."""
 
     def __init__(self, *arguments, limits=None):
         command = [VIZFLYT, *map(str, arguments)]
@@ -55,7 +55,7 @@ class Program:
             self.errors.append(line)
 
     def line(self, holds, within_s=60.0):
-        """The next line of which `holds` is true."""
+        """Returns the next line for which `holds` is true."""
         until = time.monotonic() + within_s
         while (line := self.queue.get(timeout=max(until - time.monotonic(), 0.01))) is not None:
             try:
@@ -72,7 +72,7 @@ class Program:
 
 
 def scene(folder, more="", name="course"):
-    """A generated course; returns its `arena.toml`."""
+    """Generates a course; returns its `arena.toml`."""
     made = run("scene", "generate", "race", "-o", folder / name)
     if made.returncode:
         raise OSError(made.stderr)

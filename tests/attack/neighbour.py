@@ -1,5 +1,5 @@
-"""Attacks of another user of the same computer, who takes names that the program wants and reads what it leaves open.
-See `run`."""
+"""Attacks by another user of the same computer, who occupies file names that the program needs and reads files left
+open. See `run`."""
 
 import contextlib
 import os
@@ -11,15 +11,15 @@ import time
 
 from checks import VIZFLYT, Program, check, end, scene
 
-# Wanted are 2 s from the start to the sentence; a loaded machine has five times as long.
+# The goal is 2 s from the start to the error message; a loaded machine gets five times as long.
 WITHIN_S = 10.0
-# Somebody who is nobody here; root alone can run a program as another user.
+# A user id without an account; only root can run a program as another user.
 OTHER = 54_321
 NOBODY = 65_534
 
 
 def squat(path, kind):
-    """Puts something where the program wants a file or a folder of its own."""
+    """Places an obstacle at a path where the program needs its own file or folder."""
     if kind == "pipe":
         os.mkfifo(path)
     elif kind == "folder":
@@ -36,7 +36,8 @@ def squat(path, kind):
 
 
 def timed(command, within_s, **more):
-    """Whether it ended within so long, what it said, and how long it took [s]. SIGTERM first: it shall not be deaf."""
+    """Returns whether the command ended within the limit, its output, and its duration [s]. SIGTERM comes first: the
+    command must react to it."""
     began = time.monotonic()
     process = subprocess.Popen([VIZFLYT, *map(str, command)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                                stderr=subprocess.STDOUT, text=True, **more)
@@ -54,7 +55,7 @@ def timed(command, within_s, **more):
 
 
 def names_in_the_keys_folder(folder):
-    """What a program that could write there once left, as a plugin without a cell might."""
+    """Files that a program with write access could have left there, such as a plugin without a sandbox."""
     arena = scene(folder)
     serve = ["serve", "--leaderboard=none", "--renderer=cpu", "--quic=127.0.0.1:0", "--http=127.0.0.1:0",
              "--vicon=127.0.0.1:0", "--tls=auto", arena]
@@ -75,7 +76,7 @@ def names_in_the_keys_folder(folder):
                   f"{took_s:.1f} s: {text[-300:]}")
             shutil.rmtree(keys)
     print(f"      a sentence within {max(all_took_s):.1f} s at most")
-    # Where a key would be made, a link does not lead it elsewhere.
+    # A symbolic link must not redirect a new key.
     keys = folder / "squatted"
     keys.mkdir(0o700)
     (keys / "server.key").symlink_to(folder / "elsewhere")
@@ -89,7 +90,7 @@ def names_in_the_keys_folder(folder):
 
 
 def names_in_shared_folders(folder):
-    """`/tmp` and `/dev/shm` belong to everybody."""
+    """`/tmp` and `/dev/shm` are writable for all users."""
     can_be_other = os.geteuid() == 0 and all(folder.stat().st_mode & 1 for folder in pathlib.Path(VIZFLYT).parents)
     mine = OTHER if can_be_other else os.geteuid()
     home = folder / "home"
@@ -99,7 +100,7 @@ def names_in_shared_folders(folder):
     more = {"user": mine, "group": mine, "extra_groups": []} if mine == OTHER else {}
     more["env"] = os.environ | {"HOME": str(home), "XDG_CACHE_HOME": str(home), "XDG_CONFIG_HOME": str(home / "config")}
     more["cwd"] = home
-    # Where a runtime waits for a plugin that somebody starts.
+    # Folder in which a runtime waits for a plugin started by hand.
     place = pathlib.Path(f"/tmp/vizflyt-{mine}")
     attach = ["fly", "--attach", "--headless", "--no-config", "--scene=room", "--log-dir", home / "flights"]
     if place.exists() or place.is_symlink():
@@ -129,7 +130,7 @@ def names_in_shared_folders(folder):
                     shutil.rmtree(place)
                 else:
                     place.unlink()
-    # Names that its shared memory once had.
+    # Names of the shared memory in earlier versions.
     shared = pathlib.Path("/dev/shm")
     taken = [shared / f"vizflyt{mine}_{'0' * 32}.{name}" for name in ("node.0_10_0.global_mgmt", "data", "event")]
     taken.append(shared / f"vizflyt{mine}_node.0_10_0.global_mgmt")
@@ -149,7 +150,7 @@ def names_in_shared_folders(folder):
 
 
 def what_lies_open(folder):
-    """The place of a lab that flies: its obstacles are in `truth.json`."""
+    """The folder of a flying lab: its obstacles are in `truth.json`."""
     before = set(pathlib.Path(tempfile.gettempdir()).glob("vizflyt-*"))
     lab = Program("demo", "--headless", "--seconds=3", "--log-dir", folder / "flights")
     try:
@@ -165,7 +166,7 @@ def what_lies_open(folder):
                     is_open.append(f"{path} {path.stat().st_mode & 0o777:o}")
         check("the lab's folders are its user's alone", bool(found) and not is_open, is_open)
     finally:
-        # It removes its folders.
+        # SIGTERM lets it remove its folders.
         lab.process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             lab.process.wait(10)

@@ -1,5 +1,5 @@
-"""Attacks from the network on `vizflyt serve` and `vizflyt fly`: a stranger, a team at another's vehicle, a page
-elsewhere in the instructor's browser. See `run`."""
+"""Attacks from the network on `vizflyt serve` and `vizflyt fly`: an unauthenticated client, a team that targets
+another's vehicle, a foreign page in the instructor's browser. See `run`."""
 
 import base64
 import contextlib
@@ -18,16 +18,16 @@ import time
 
 from checks import Program, check, end, run, scene
 
-# Where strangers call from; the instructor's page is at 127.0.0.1.
+# Address of the attackers; the instructor's page is at 127.0.0.1.
 ELSEWHERE = "127.0.0.2"
-# Wanted are 0.2 s; a loaded machine has five times as long.
+# The goal is 0.2 s; a loaded machine gets five times as long.
 STOP_WITHIN_S = 1.0
 PRESSES = 20
 SECRETS = ("heron", "wasp", "hidden-course")
 
 
 class Lab(Program):
-    """`vizflyt serve` of two vehicles, with a leaderboard of two teams."""
+    """`vizflyt serve` with two vehicles and a leaderboard of two teams."""
 
     def __init__(self, folder, *more, limits=None):
         arena = folder / SECRETS[2] / "arena.toml"
@@ -52,7 +52,7 @@ class Lab(Program):
         return socket.create_connection(self.address, 10, (source, 0))
 
     def ask(self, request, *headers, cookie="", body="", source="127.0.0.1"):
-        """The answer's status, its head, its body, and how long it took [s]. `headers` may replace `Host`."""
+        """Returns the answer's status, head, body, and duration [s]. `headers` may replace `Host`."""
         own = [] if any(header.startswith("Host:") for header in headers) else [f"Host: {self.host}"]
         lines = [f"{request} HTTP/1.1", *own, *headers, "Connection: close", f"Content-Length: {len(body)}"]
         if cookie:
@@ -73,7 +73,7 @@ class Lab(Program):
         return status, text
 
     def stop(self, during):
-        """Presses the instructor's button many times, each on a fresh connection."""
+        """Presses the instructor's stop button many times, each on a new connection."""
         took_s = []
         wrong = []
         for _ in range(PRESSES):
@@ -84,7 +84,7 @@ class Lab(Program):
             except OSError as error:
                 status, each_s = str(error), float("inf")
             took_s.append(each_s)
-            # No runtime is there to be stopped; only an instructor is told so.
+            # No runtime is connected; only an instructor gets this answer.
             if status != 409:
                 wrong.append(status)
         took_s.sort()
@@ -102,7 +102,7 @@ class Lab(Program):
 
 
 def lives(stream, for_s=1.5):
-    """Whether a WebSocket says something and is not closed."""
+    """Returns whether a WebSocket receives data and is not closed."""
     stream.settimeout(for_s)
     until, got = time.monotonic() + for_s, 0
     with contextlib.suppress(TimeoutError):
@@ -115,7 +115,7 @@ def lives(stream, for_s=1.5):
 
 
 class Drain:
-    """Reads what comes on many sockets, and forgets it."""
+    """Reads and discards the data of many sockets."""
 
     def __init__(self, streams):
         self.selector = selectors.DefaultSelector()
@@ -141,11 +141,11 @@ class Drain:
 
 
 def the_stop_button(folder):
-    """Taken away by whoever has many connections."""
+    """Many open connections must not block the stop button."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     most = min(10_000, (hard if hard > 0 else 1 << 20) - 300)
-    # What a login shell has.
+    # Limit of a login shell.
     lab = Lab(folder, limits="-S -n 1024")
     try:
         lab.stop("nobody else")
@@ -194,7 +194,7 @@ def the_stop_button(folder):
 
 
 def the_page(folder):
-    """A stranger, a page elsewhere in the instructor's browser, and a team."""
+    """An unauthenticated client, a foreign page in the instructor's browser, and a team."""
     run("password", "--keys", folder / "server", input="of the instructor\n")
     lab = Lab(folder)
     try:
@@ -243,7 +243,7 @@ def the_page(folder):
 
 
 def the_check_in(folder):
-    """Team B, with its own token, before A takes off."""
+    """Team B checks in with its own token before team A takes off."""
     board = folder / "runs.sqlite"
     tokens = {}
     for team in ("ants", "bees"):
@@ -274,7 +274,7 @@ def plain_http(folder):
     arena = folder / SECRETS[2] / "arena.toml"
     command = ["serve", "--leaderboard=none", "--renderer=cpu", "--quic=127.0.0.1:0", "--vicon=127.0.0.1:0", "--keys",
                folder / "server", arena]
-    # An address for documents (RFC 5737) that no computer has: public, and never bound.
+    # Address for documentation (RFC 5737), which no computer has: public, and never bound.
     done = run(*command, "--http=203.0.113.7:8080", within_s=60)
     is_refused = done.returncode != 0 and "add --tls auto" in done.stderr
     check("plain HTTP is refused on a public address", is_refused, done.stderr)
@@ -308,7 +308,7 @@ def plain_http(folder):
 
 
 def the_unpaired(folder):
-    """A runtime that the server does not know."""
+    """A runtime that is not paired with the server."""
     lab = Lab(folder, "--leaderboard=none", f"--pair=team:{SECRETS[0]}")
     try:
         code = lab.line(lambda line: "pairing" in line)["pairing"]["code"].replace(" ", "")
@@ -332,7 +332,7 @@ def the_unpaired(folder):
 
 
 def the_autopilots_port(folder):
-    """Somebody who sends to the runtime's MAVLink port first, and more than the autopilot does."""
+    """An attacker sends to the runtime's MAVLink port before the autopilot, and at a higher rate."""
     lab = Lab(folder, "--leaderboard=none", f"--pair=team:{SECRETS[0]}")
     programs: list[Program] = [lab]
     try:
@@ -345,7 +345,7 @@ def the_autopilots_port(folder):
         programs.append(runtime)
         port = runtime.line(lambda line: "ready" in line)["mavlink"].rsplit(":", 1)[1]
         is_over = threading.Event()
-        # MAVLink 2: COMMAND_ACK of a system 1, whose checksum is wrong; one byte; noise.
+        # MAVLink 2: COMMAND_ACK of system 1 with a wrong checksum; one byte; noise.
         packets = [b"x", bytes.fromhex("fd0300000001014d0000900100") + b"\x00\x00", os.urandom(300)]
 
         def flood():

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""A plugin that attacks: it says of each attempt whether it was refused, and attaches to nothing.
+"""A plugin that attacks: it reports for each attempt whether it was refused, and never attaches.
 
-`targets.json` beside it names what it is after.
+`targets.json` in the same folder lists its targets.
 """
 
 import array
@@ -20,7 +20,7 @@ LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def attempt(name, act):
-    """Says how an attempt went: `act` raises OSError or returns something false if it was refused."""
+    """Reports the result of an attempt: `act` raises OSError or returns a false value if it was refused."""
     try:
         found = act()
     except OSError as error:
@@ -75,7 +75,7 @@ def write(path):
 
 
 def runtime_memory():
-    """The descriptors that the runtime hands over with its socket."""
+    """Returns the file descriptors that the runtime passes through its socket."""
     place = sys.argv[sys.argv.index("--vizflyt-service") + 1] if "--vizflyt-service" in sys.argv else None
     if place is None:
         place = next((a.split("=", 1)[1] for a in sys.argv if a.startswith("--vizflyt-service=")), "")
@@ -100,7 +100,7 @@ def runtime_memory():
 
 
 def break_memory():
-    """Truncates and overwrites what the runtime maps."""
+    """Truncates and overwrites the memory that the runtime maps."""
     broken = []
     for descriptor in runtime_memory():
         try:

@@ -1,23 +1,23 @@
-"""docs/BENCHMARKS.md: its measured tables, found and replaced; and the Markdown tables that programs print.
+"""Finds and replaces the measured tables of docs/BENCHMARKS.md, and reads the Markdown tables printed by programs.
 
-A measured table stands between `<!-- bench:NAME -->` and `<!-- /bench -->`, each alone on its line. Pure: text in, text
-out.
+A measured table stands between `<!-- bench:NAME -->` and `<!-- /bench -->`, each on its own line. Pure functions: text
+in, text out.
 """
 
 import re
 
 START = re.compile(r"<!-- bench:([a-z][a-z0-9-]*) -->")
 END = "<!-- /bench -->"
-# Whoever writes one of these meant a marker.
+# A damaged marker: text that is similar to a marker.
 LIKE_A_MARKER = re.compile(r"<!--.*\bbench\b.*-->|<!--\s*/?\s*bench\b")
 
 
 class DocumentError(Exception):
-    """The document's markers are missing or damaged; the message says where, and what to do."""
+    """The document's markers are missing or damaged; the message gives the place and the remedy."""
 
 
 def blocks(text: str) -> dict[str, tuple[int, int]]:
-    """Returns for each marked table its lines: the first after the start, and the line of the end; counted from 0."""
+    """Returns the lines of each marked table: the first after the start, and the line of the end; counted from 0."""
     found: dict[str, tuple[int, int]] = {}
     name, begun = "", 0
     for number, line in enumerate(text.split("\n")):
@@ -43,7 +43,7 @@ def blocks(text: str) -> dict[str, tuple[int, int]]:
 
 
 def block(text: str, name: str) -> str:
-    """Returns what stands between the markers of `name`, without the empty lines around it."""
+    """Returns the text between the markers of `name`, without the empty lines around it."""
     begin, end = place(text, name)
     return "\n".join(text.split("\n")[begin:end]).strip("\n")
 
@@ -56,7 +56,7 @@ def place(text: str, name: str) -> tuple[int, int]:
 
 
 def replaced(text: str, tables: dict[str, str]) -> str:
-    """Returns the document with these tables in place of those that it has; all are there, or nothing is replaced."""
+    """Returns the document with its tables replaced; raises if a table is missing, without any replacement."""
     for name, table in tables.items():
         begin, end = place(text, name)
         lines = text.split("\n")
@@ -73,7 +73,7 @@ def markdown(head: list[str], rows: list[list[str]]) -> str:
 
 
 def printed_tables(text: str) -> list[list[list[str]]]:
-    """Returns the Markdown tables that a program printed: of each its rows, the head first, as cells."""
+    """Returns the Markdown tables in a program's output: for each its rows as cells, the head first."""
     tables: list[list[list[str]]] = []
     inside = False
     for line in text.split("\n"):

@@ -1,7 +1,7 @@
-"""Measured figures: the best of several turns, what moved against the committed ones, and both as JSON. Pure.
+"""Measured figures: the best of several turns, changes against the committed figures, and both as JSON. Pure functions.
 
-Times and rates are compared as ratios to a reference kernel that was timed in the same turns: where the whole machine
-is slower than it was, so is the kernel, and the ratio stays.
+Times and rates are compared as ratios to a reference kernel timed in the same turns: a slower machine slows the kernel
+too, so the ratio stays constant.
 """
 
 import json
@@ -11,19 +11,19 @@ import statistics
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
-# What a reader of the tables would call another figure.
+# Minimum ratio of a change worth reporting.
 MOVED = 1.10
-# A time: smaller is faster. A rate: greater is faster. A count does not depend on the machine's speed.
+# A time: smaller is faster. A rate: larger is faster. A count does not depend on the machine's speed.
 KINDS = ("time", "rate", "count")
 
 
 class FiguresError(Exception):
-    """The file of committed figures is damaged; the message says where, and what to do."""
+    """The file of committed figures is damaged; the message gives the place and the remedy."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure: its value in the unit that its name or its column has, how many digits are shown, and its kind."""
+    """A figure: its value in the unit of its name or column, the number of digits shown, and its kind."""
 
     value: float
     digits: int
@@ -45,13 +45,13 @@ def count(value: float, digits: int = 0) -> Figure:
     return Figure(round(value, digits + 2), digits, "count")
 
 
-# The figures of a table by their names, "ROW | COLUMN", in the table's order.
+# The figures of a table by name, "ROW | COLUMN", in the table's order.
 Figures = dict[str, Figure]
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Processor's time of the two kernels, the least of a turn: of computing, and of copying memory. [ms]"""
+    """Processor time of the two kernels, computing and copying memory: the minimum of a turn. [ms]"""
 
     computing_ms: float
     memory_ms: float
@@ -62,7 +62,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Taken:
-    """The figures of a table, and where they were taken."""
+    """The figures of a table, and the machine they were measured on."""
 
     figures: Figures
     reference: Reference
@@ -74,7 +74,7 @@ class Taken:
 
 @dataclass(frozen=True)
 class Moved:
-    """A figure that is another one than it was; `ratio` is new by old, the machine's own change taken out."""
+    """A changed figure; `ratio` is new divided by old, corrected for the machine's own change."""
 
     name: str
     before: Figure
@@ -83,15 +83,15 @@ class Moved:
 
 
 def number(cell: str, kind: str) -> Figure | None:
-    """Returns the figure that a printed cell is; nothing where it is no plain number."""
+    """Returns the figure in a printed cell, or None if the cell is not a plain number."""
     if not re.fullmatch(r"-?\d+(\.\d+)?", cell):
         return None
     return Figure(float(cell), len(cell.partition(".")[2]), kind)
 
 
 def best(turns: list[Figures]) -> Figures:
-    """Returns of each figure the turn that other work disturbed least: times the least, rates the greatest, counts the
-    median."""
+    """Returns for each figure its value least disturbed by other work: the minimum of times, the maximum of rates, the
+    median of counts."""
     names = list(turns[0])
     for turn in turns:
         if list(turn) != names:
@@ -107,20 +107,20 @@ def least(references: list[Reference]) -> Reference:
 
 
 def expected(before: Figure, machine: float) -> Figure:
-    """Returns what a figure would be now, where the reference takes `machine` times as long as it took."""
+    """Returns the expected figure on a machine whose reference kernel takes `machine` times as long."""
     factor = {"time": machine, "rate": 1.0 / machine, "count": 1.0}[before.kind]
     return replace(before, value=before.value * factor)
 
 
 def moved(before: Taken, after: Taken, kernel: str) -> list[Moved]:
-    """Returns the figures of both that differ by more than 10 %, by the ratio to the kernel, the most moved first."""
+    """Returns the figures in both sets whose ratio to the kernel changed by more than 10 %, largest change first."""
     machine = after.reference.of(kernel) / before.reference.of(kernel)
     found = []
     for name, figure in after.figures.items():
         if name not in before.figures:
             continue
         by_machine = expected(before.figures[name], machine)
-        # Below the last digit that is shown there is nothing to see.
+        # A change below the last digit shown is not visible.
         if str(by_machine) == str(figure):
             continue
         changed = figure.value / by_machine.value if by_machine.value else math.inf
@@ -130,7 +130,7 @@ def moved(before: Taken, after: Taken, kernel: str) -> list[Moved]:
 
 
 def rows(figures: Figures) -> tuple[list[str], list[list[str]]]:
-    """Returns the columns' names, and the rows: name and cells; a cell without a figure is empty."""
+    """Returns the column names, and the rows: name and cells; a cell without a figure is empty."""
     split = [name.split(" | ") for name in figures]
     columns = list(dict.fromkeys(column for _, column in split))
     names = list(dict.fromkeys(row for row, _ in split))
@@ -138,7 +138,7 @@ def rows(figures: Figures) -> tuple[list[str], list[list[str]]]:
 
 
 def to_json(tables: dict[str, Taken]) -> str:
-    """Returns the file of committed figures: tables by name, a figure a line."""
+    """Returns the file of committed figures: tables by name, one figure per line."""
     out = []
     for name in sorted(tables):
         taken = asdict(tables[name])
@@ -151,7 +151,7 @@ def to_json(tables: dict[str, Taken]) -> str:
 
 
 def from_json(text: str) -> dict[str, Taken]:
-    """Reads what `to_json` wrote."""
+    """Reads the output of `to_json`."""
     try:
         return {name: read_table(table) for name, table in json.loads(text).items()}
     except (ValueError, TypeError, KeyError, AttributeError) as error:

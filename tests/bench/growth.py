@@ -1,6 +1,6 @@
-"""What an image, a server and a log cost over how much there is: splats, pixels, cameras, vehicles, pages, length.
+"""Cost of an image, a server and a log as a function of a size: splats, pixels, cameras, vehicles, pages, length.
 
-Each curve is measured in one go, and is judged by its slope in logarithms: 1 grows as what it is over, 0 not at all.
+Each curve is measured in one run and judged by its slope in logarithms: 1 is proportional growth, 0 is constant cost.
 """
 
 import array
@@ -18,7 +18,7 @@ from lab import Lab
 
 
 class Curve(NamedTuple):
-    """What a curve is of, over what, and how steep it may be at its end: the exponent."""
+    """A curve: its quantity, its variable, and the maximum exponent at its end."""
 
     panel: str
     over: str
@@ -26,7 +26,7 @@ class Curve(NamedTuple):
     most: float
 
 
-# What is never to be worse than in proportion may be a little, by noise and by caches that overflow.
+# Tolerance above 1 for curves that must be at most proportional: noise, and caches that overflow.
 PROPORTIONAL = 1.15
 CURVES = {
     "image, every splat": Curve("processor of a 640x480 image [ms]", "splats in the scene", "every splat",
@@ -69,7 +69,7 @@ def measure(lab: Lab) -> Figures:
 
 
 def splats(lab: Lab, add) -> None:
-    """Forests beside one another, seen from the corner of the whole along one side."""
+    """Forests side by side, seen from the corner of the whole along one side."""
     camera = lab.camera("growth", 1.0, 0.0, 1.2)
     lab.scene("forest")
     for number in SPLATS:
@@ -81,13 +81,13 @@ def splats(lab: Lab, add) -> None:
             found = json.loads(used.output)
             add(curve, number, found["processor_ms"])
         add("scene, memory", number, used.peak_mb)
-        # Of the command what is not images, five before those that count among them.
+        # Processor time of the command besides its images: five before the counted ones, and these.
         add("scene, packing", number, used.processor_s * 1e3 - 15 * found["processor_ms"])
         (lab.folder / name).unlink()
 
 
 def write_splats(source: Path, target: Path, number: int) -> None:
-    """Writes a PLY of so many splats: a share of the forest's, or forests beside one another."""
+    """Writes a PLY with `number` splats: a subset of the forest, or several forests side by side."""
     head, _, body = source.read_bytes().partition(b"end_header\n")
     names = re.findall(rb"property float (\w+)", head)
     width, x, y = len(names), names.index(b"x"), names.index(b"y")
@@ -137,7 +137,7 @@ def server(lab: Lab, add) -> None:
 
 
 def logs(lab: Lab, add) -> None:
-    """Logs of flights through the forest, at a third of its speed, that are landed after so many seconds."""
+    """Logs of flights through the forest at a third of its speed, landed after different times."""
     folder = lab.folder / "slow"
     folder.mkdir(exist_ok=True)
     arena = lab.folder / lab.scene("forest")
@@ -160,7 +160,7 @@ def points(figures: Figures, curve: str) -> list[tuple[float, float]]:
 
 
 def exponent(curve: list[tuple[float, float]]) -> float:
-    """Returns the slope of a curve's last step in logarithms: 1 where it grows as what it is over."""
+    """Returns the slope of a curve's last step in logarithms: 1 is proportional growth."""
     (x0, y0), (x1, y1) = curve[-2:]
     return math.log(y1 / y0) / math.log(x1 / x0)
 
@@ -178,7 +178,7 @@ def table(figures: Figures) -> str:
 
 
 def drawing(figures: Figures) -> str:
-    """Returns the SVG: a panel for each kind of figure."""
+    """Returns the SVG, with one panel for each kind of figure."""
     panels: dict[tuple[str, str], list[plot.Curve]] = {}
     for name, curve in CURVES.items():
         panels.setdefault((curve.panel, curve.over), []).append(plot.Curve(curve.name, points(figures, name)))

@@ -1,4 +1,4 @@
-"""What tables measure with: the built program, and a folder for scenes and files."""
+"""Environment of the measurements: the built program, and a folder for scenes and files."""
 
 import json
 import struct
@@ -11,7 +11,7 @@ import machine
 
 
 class Lab(NamedTuple):
-    """The built program, and the folder that its commands run in."""
+    """The built program, and the working folder of its commands."""
 
     program: str
     folder: Path
@@ -29,7 +29,7 @@ class Lab(NamedTuple):
         return json.loads(self.vizflyt(*arguments, "--json", threads=threads).output)
 
     def scene(self, kind: str) -> str:
-        """Returns the arena of a generated scene of seed 7, made if it is not there."""
+        """Returns the arena of a generated scene of seed 7; generates it if it is missing."""
         if not (self.folder / kind / "arena.toml").exists():
             self.vizflyt("scene", "generate", kind, "--seed", "7", "-o", kind)
         return f"{kind}/arena.toml"
@@ -43,7 +43,8 @@ class Lab(NamedTuple):
         return path.name
 
     def fly(self, project: str, envs: int, more: list[str], seconds: float) -> tuple[int, float]:
-        """Steps the courses of `vizflyt gym` as Python's package does; returns steps, and the processor's time. [s]"""
+        """Steps the courses of `vizflyt gym` as the Python package does; returns the number of steps and the processor
+        time. [s]"""
         command = [self.program, "gym", "--log-level", "error", "--project", project, "--envs", str(envs), *more]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
             head = json.loads(process.stdout.readline())
@@ -55,12 +56,12 @@ class Lab(NamedTuple):
             ends = 4 * envs * (head["state"] + head["figures"])
 
             def step(resets: bytes) -> bytes:
-                """Takes a step; returns which episodes are over: a byte each."""
+                """Takes a step; returns a byte for each episode: whether it is over."""
                 process.stdin.write(resets + seeds + actions)
                 process.stdin.flush()
                 return process.stdout.read(length)[ends:ends + envs]
 
-            # What is over would cost nothing more: it begins anew, as Gymnasium's vectors do.
+            # Episodes that are over would cost no more time: reset them, as Gymnasium's vectors do.
             over = step(b"\x01" * envs)
             watched = machine.Watched(process.pid)
             steps, begun, before_s = 0, time.monotonic(), watched.processor_s()

@@ -1,4 +1,4 @@
-"""This computer: the reference kernels, what it is, and commands with what they took of it."""
+"""This computer: reference kernels, its processor, and commands with their resource usage."""
 
 import os
 import subprocess
@@ -11,18 +11,18 @@ from typing import NamedTuple
 
 from figures import Reference
 
-# By vfork a command's greatest memory would be this process's own at least; by fork it is no more than it has just now.
+# With vfork, a command's peak memory would be at least this process's own peak; with fork, only its current size.
 vars(subprocess)["_USE_VFORK"] = False
-# As many times each kernel runs in a turn; the least counts.
+# Repeats of each kernel in a turn; the minimum counts.
 REPEATS = 9
 
 
 class CommandFailed(Exception):
-    """A command of a table did not end with status 0; the message has the end of what it said."""
+    """A command of a table ended with a status other than 0; the message has the end of its output."""
 
 
 class Used(NamedTuple):
-    """A command's standard output, and what it took: all its threads' time, and its greatest resident memory."""
+    """A command's standard output, the processor time of all its threads, and its peak resident memory."""
 
     output: str
     processor_s: float
@@ -30,7 +30,7 @@ class Used(NamedTuple):
 
 
 def reference() -> Reference:
-    """Times the kernels: integers and branches within a core's caches; and copying 64 MB, which no cache holds."""
+    """Times the kernels: integers and branches within a core's caches, and a copy of 64 MB, larger than any cache."""
     words = b"".join(b"%d:%d;" % (i * i % 977, i * 31 % 1009) for i in range(24_000))
     source, target = bytes(64 << 20), bytearray(64 << 20)
 
@@ -41,7 +41,7 @@ def reference() -> Reference:
 
 
 def least_ms(kernel: Callable[[], object]) -> float:
-    """Returns the processor's time of the kernel, the least of its repeats: what others take does not count. [ms]"""
+    """Returns the kernel's processor time, the minimum of its repeats; time of other processes does not count. [ms]"""
     times = []
     for _ in range(REPEATS):
         start = time.thread_time()
@@ -51,7 +51,7 @@ def least_ms(kernel: Callable[[], object]) -> float:
 
 
 def processor() -> str:
-    """Returns the processor's name and how many of it there are."""
+    """Returns the processor's name and its number of cores."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return f"{os.cpu_count()} x {names[0] if names else os.uname().machine}"
@@ -62,8 +62,8 @@ def load() -> float:
 
 
 def run(command: list[str], folder: Path | None = None, env: dict[str, str] | None = None, most: int = 0) -> Used:
-    """Runs a command to its end, with these variables of environment besides those that are set; `most` is the greatest
-    status that is no failure."""
+    """Runs a command to its end with these additional environment variables; `most` is the highest status that is not a
+    failure."""
     env = {**os.environ, **(env or {})}
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=errors, cwd=folder, env=env)
@@ -78,7 +78,7 @@ def run(command: list[str], folder: Path | None = None, env: dict[str, str] | No
 
 
 class Watched:
-    """What a running process has taken so far, by /proc."""
+    """Resource usage of a running process so far, from /proc."""
 
     def __init__(self, pid: int) -> None:
         self.folder = Path(f"/proc/{pid}")

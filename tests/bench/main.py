@@ -45,7 +45,7 @@ def arguments() -> argparse.Namespace:
 
 
 def take(name: str, lab: Lab, turns: int | None) -> figures.Taken:
-    """Measures a table, the kernels before, between and after its turns."""
+    """Measures a table, with the kernels before, between and after its turns."""
     table = tables.MEASURED[name]
     load, references, taken = machine.load(), [machine.reference()], []
     for _ in range(turns or table.turns):
@@ -60,7 +60,7 @@ def take(name: str, lab: Lab, turns: int | None) -> figures.Taken:
 
 
 def tell(name: str, before: figures.Taken | None, after: figures.Taken) -> None:
-    """Prints what moved."""
+    """Prints the changed figures."""
     if before is None:
         print("   not committed yet: nothing to compare with")
         return
@@ -95,7 +95,7 @@ def read_committed() -> dict[str, figures.Taken]:
 
 
 def write(taken: dict[str, figures.Taken], text: str) -> None:
-    """Writes figures, document and drawings; the document is made wholly before anything is written."""
+    """Writes figures, document and drawings; builds the whole document before it writes any file."""
     shown = {name: tables.shown(name, one) for name, one in taken.items()}
     document = replaced(text, {**shown, "by-hand": tables.by_hand()})
     COMMITTED.write_text(figures.to_json(taken))
@@ -125,7 +125,7 @@ def main() -> int:
             print(f"{name}", flush=True)
             after = take(name, lab, args.turns)
             tell(name, committed.get(name), after)
-            # What was measured is kept, whatever becomes of the next table.
+            # Save each table at once, so that a failure of the next one does not lose it.
             if args.update:
                 write({**read_committed(), name: after}, DOCUMENT.read_text())
     return 0

@@ -1,25 +1,25 @@
-"""Curves as one SVG of small panels, both axes logarithmic. Pure: figures in, text out."""
+"""Draws curves as one SVG of small panels, both axes logarithmic. Pure functions: figures in, text out."""
 
 import math
 from typing import NamedTuple
 
 
 class Curve(NamedTuple):
-    """A curve: its name, and its points: (over what, how much), both positive."""
+    """A curve: its name, and its points (x, y), both positive."""
 
     name: str
     points: list[tuple[float, float]]
 
 
 class Panel(NamedTuple):
-    """A panel: what grows, over what, and its curves."""
+    """A panel: the quantity, its variable, and its curves."""
 
     title: str
     over: str
     curves: list[Curve]
 
 
-# They read on white and on black.
+# Readable on white and on black.
 COLOURS = ["#d1495b", "#2a9d8f", "#e09f3e", "#3d7ea6"]
 GREY = "#808080"
 WIDTH, HEIGHT, COLUMNS = 320, 300, 3
@@ -28,7 +28,7 @@ LEGEND = 15
 
 
 def decades(values: list[float]) -> tuple[int, int]:
-    """Returns the powers of ten that hold all values."""
+    """Returns the exponents of the powers of ten that enclose all values."""
     low, high = math.floor(math.log10(min(values)) + 1e-9), math.ceil(math.log10(max(values)) - 1e-9)
     return low, max(high, low + 1)
 
@@ -39,7 +39,7 @@ def short(power: int) -> str:
 
 
 def panel(drawn: Panel, left: float, top: float) -> list[str]:
-    """Returns the elements of a panel whose corner is there."""
+    """Returns the elements of a panel with its corner at (left, top)."""
     points = [point for curve in drawn.curves for point in curve.points]
     (x_low, x_high), (y_low, y_high) = (decades([point[axis] for point in points]) for axis in (0, 1))
     wide, high = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM - LEGEND * len(drawn.curves)

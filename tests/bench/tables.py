@@ -1,7 +1,7 @@
-"""The tables of docs/BENCHMARKS.md: the command of each, how its rows are made, and what stays by hand.
+"""The tables of docs/BENCHMARKS.md: the command of each, how its rows are made, and the tables filled in by hand.
 
-A table is measured in turns; each turn runs its command once and returns figures by "ROW | COLUMN". What the document
-shows is made of figures alone, so it can be made again without measuring.
+A table is measured in turns; each turn runs its command once and returns figures by "ROW | COLUMN". The text in the
+document depends only on the figures, so it can be rebuilt without measuring.
 """
 
 import json
@@ -22,22 +22,22 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class Table(NamedTuple):
-    """A measured table: the commands that a reader would type, and what a turn of it returns."""
+    """A measured table: the commands that a reader would type, and the function of one turn."""
 
     commands: list[str]
     measure: Callable[[Lab], Figures]
-    # What stands above the rows' names; of several columns where a name has several parts.
+    # Head of the column of row names; several columns if a name has several parts.
     corner: str = ""
-    # What its times are compared by.
+    # Reference kernel for its times.
     kernel: str = "computing"
     turns: int = 3
-    # Lines of Markdown of its own, in place of the grid.
+    # Markdown in place of the default grid.
     layout: Callable[[Figures], str] | None = None
-    # A drawing of docs/ beside it, by its file's name.
+    # A drawing for this table: its file name in docs/, and its function.
     drawing: tuple[str, Callable[[Figures], str]] | None = None
 
 
-# Where each generated scene is seen from: the start, at the height of flight. [m]
+# View of each generated scene: the start, at flight height. [m]
 VIEWS = {"forest": (1.0, 0.0, 1.2), "race": (0.9, 0.0, 1.2), "room": (0.9, 0.0, 1.2)}
 
 
@@ -58,14 +58,14 @@ def imaging(lab: Lab) -> Figures:
     arena, camera = lab.scene("forest"), lab.camera("forest", *VIEWS["forest"])
     found = lab.json("bench", "imaging", arena, "--camera", camera, "--size", "176x132", "--images", "15", "--renderer",
                      "cpu", threads=1)
-    # An event camera's name tells how many events there were.
+    # An event camera's name contains the number of events.
     kinds = {kind["name"].partition(" (")[0]: kind["median_ms"] for kind in found["kinds"]}
     return {"rendering | ms": time(found["render_ms"]),
             **{f"{name} | ms": time(ms) for name, ms in kinds.items() if not name.startswith("perfect")}}
 
 
 def shares(corner: str) -> Callable[[Figures], str]:
-    """Returns a layout with a column of each row's share of the first one; both are the best of their turns."""
+    """Returns a layout with a column of each row's share of the first row; both are the best of their turns."""
     def layout(figures: Figures) -> str:
         columns, lines = rows(figures)
         first = next(iter(figures.values())).value
@@ -148,13 +148,13 @@ def gym(lab: Lab) -> Figures:
 
 
 def cargo(arguments: list[str], env: dict[str, str] | None = None) -> str:
-    """Returns what a benchmark of a crate prints; it is built first."""
+    """Returns the output of a crate's benchmark, which is built first."""
     return machine.run(["cargo", "bench", "--locked", "--quiet", *arguments], ROOT, env=env).output
 
 
 def printed(lines: str, timed: tuple[str, ...] = (), columns: tuple[str, ...] = (), head: int = 1) -> Figures:
-    """Returns the figures of the last table that a benchmark printed: a row's name is its first `head` cells, its
-    columns have these names or their own."""
+    """Returns the figures of the last table that a benchmark printed: a row's name is its first `head` cells; `columns`
+    replaces the column names."""
     names, *rest = printed_tables(lines)[-1]
     out: Figures = {}
     for cells in rest:
@@ -179,8 +179,8 @@ def rules(_: Lab) -> Figures:
 
 
 def criterion_ns(bench: str, package: str, *arguments: str) -> dict[str, float]:
-    """Runs a benchmark; returns of each of its parts the least sample: what the wall's clock measures is disturbed by
-    whatever else runs. [ns]"""
+    """Runs a benchmark; returns the minimum sample of each part, because other processes disturb wall-clock times.
+    [ns]"""
     with tempfile.TemporaryDirectory() as folder:
         cargo(["-p", package, "--bench", bench, "--", "--noplot", *arguments], {"CRITERION_HOME": folder})
         return {json.loads(path.read_text())["full_id"]: least_sample_ns(path.with_name("sample.json").read_text())
@@ -188,7 +188,7 @@ def criterion_ns(bench: str, package: str, *arguments: str) -> dict[str, float]:
 
 
 def least_sample_ns(text: str) -> float:
-    """Returns the least time of an iteration, of the samples that criterion wrote. [ns]"""
+    """Returns the minimum time of an iteration in criterion's samples. [ns]"""
     sample = json.loads(text)
     return min(time_ns / iterations for iterations, time_ns in zip(sample["iters"], sample["times"]))
 
@@ -196,7 +196,7 @@ def least_sample_ns(text: str) -> float:
 def pose(_: Lab) -> Figures:
     columns = ("as measured mm", "predicted mm", "times less", "times less, with IMU", "as measured deg",
                "predicted deg", "with IMU deg", "accepted %")
-    # Of the benchmark the table alone: none of its timings has this name.
+    # Print only the table: no timing has this name.
     return printed(cargo(["-p", "vizflyt-arena", "--bench", "pose", "--", "the table alone"]), columns=columns, head=6)
 
 
@@ -247,7 +247,7 @@ MEASURED: dict[str, Table] = {
 
 
 class ByHand(NamedTuple):
-    """A table that is typed: which, its command, and what it needs beyond this program and some minutes."""
+    """A table filled in by hand: its name, its command, and its requirements beyond this program and some minutes."""
 
     section: str
     command: str
@@ -292,7 +292,7 @@ def by_hand() -> str:
 
 
 def shown(name: str, taken: Taken) -> str:
-    """Returns what the document has between the markers: commands, table, and where the figures were taken."""
+    """Returns the text between the document's markers: commands, table, and the machine of the figures."""
     table = MEASURED[name]
     if table.layout:
         grid = table.layout(taken.figures)

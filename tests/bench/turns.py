@@ -1,7 +1,7 @@
-"""The command line of tests/bench/turns: the loop flown by two builds in turns.
+"""The command line of tests/bench/turns: two builds fly the loop in alternation.
 
-A computer that is shared is faster at one time than at another; of two builds that fly one after the other, again and
-again, each pair is of about the same time, and the median of the pairs' ratios is the builds' own.
+The speed of a shared computer varies with time. When two builds alternate, each pair flies at about the same time, and
+the median of the pairs' ratios shows the difference between the builds.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import machine
 
-# What is compared: names, and where a report of the demo has them.
+# Compared quantities: name, and key in the demo's report.
 COMPARED = {"age p50 [ms]": "age_ms_p50", "age p99 [ms]": "age_ms_p99", "images a second": "image_hz",
             "drawing p50 [ms]": "render_ms_p50", "processor [s]": "processor_s"}
 
@@ -48,7 +48,7 @@ def arguments() -> argparse.Namespace:
 
 
 def fly(program: Path, folder: Path, more: list[str], pages: int) -> dict[str, float]:
-    """Flies once; returns what is compared."""
+    """Flies once; returns the compared quantities."""
     report = folder / "report.json"
     with watched(pages) as address:
         used = machine.run([str(program.resolve()), "demo", "--headless", "--seed", "7", "--seconds", "90", "--report",
@@ -59,7 +59,7 @@ def fly(program: Path, folder: Path, more: list[str], pages: int) -> dict[str, f
 
 @contextlib.contextmanager
 def watched(pages: int) -> Iterator[list[str]]:
-    """Opens so many pages; gives what the demo is to be told for it."""
+    """Opens `pages` pages; yields the additional arguments for the demo."""
     if pages == 0:
         yield []
         return
@@ -77,7 +77,7 @@ def watched(pages: int) -> Iterator[list[str]]:
 
 
 def ratios(pairs: dict[str, list[tuple[float, float]]]) -> list[str]:
-    """Returns a line for each name: medians before and after, and of the pairs' ratios median, least and greatest."""
+    """Returns a line for each name: medians before and after; median, minimum and maximum of the pairs' ratios."""
     lines = []
     for name, values in pairs.items():
         before, after = (statistics.median(pair[i] for pair in values) for i in (0, 1))
@@ -92,7 +92,7 @@ def main() -> None:
     pairs: dict[str, list[tuple[float, float]]] = {name: [] for name in COMPARED}
     with tempfile.TemporaryDirectory() as folder:
         for turn in range(args.turns):
-            # Whoever flies first finds the computer as it was left: each is first in every second turn.
+            # The first flight of a pair finds the computer in another state: alternate which build is first.
             order = [0, 1] if turn % 2 == 0 else [1, 0]
             flown = {which: fly((args.before, args.after)[which], Path(folder), args.demo, args.pages * which)
                      for which in order}

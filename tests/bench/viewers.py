@@ -1,7 +1,7 @@
-"""A running server with poses that come in and pages that watch: what it takes of the computer for what it does.
+"""A running server with incoming poses and open pages: its resource usage per unit of work.
 
-On a computer that is busy a server gets fewer poses and sends fewer pictures, so its time is told for a hundred poses
-of each vehicle, and for a picture of each camera to each page.
+On a busy computer a server gets fewer poses and sends fewer pictures, so its time is given per hundred poses of each
+vehicle, and per picture of each camera to each page.
 """
 
 import base64
@@ -22,8 +22,8 @@ BINARY = 2
 
 
 class Taken(NamedTuple):
-    """The server's processor time [ms] and resident memory [MB], and what it did meanwhile: poses of each vehicle that
-    came, and pictures that all pages got together."""
+    """The server's processor time [ms] and resident memory [MB], with its work in this time: poses received for each
+    vehicle, and pictures sent to all pages together."""
 
     processor_ms: float
     resident_mb: float
@@ -32,7 +32,7 @@ class Taken(NamedTuple):
 
 
 class Sender:
-    """Sends a hundred poses a second of each vehicle, which hangs in the air where the flight begins."""
+    """Sends a hundred poses a second for each vehicle, which hovers at the start of the flight."""
 
     def __init__(self, address: str, names: list[str]) -> None:
         host, _, port = address.rpartition(":")
@@ -60,7 +60,7 @@ class Sender:
 
 
 class Page:
-    """A page's WebSocket (RFC 6455): of what comes, pictures are counted."""
+    """A page's WebSocket (RFC 6455): counts the pictures received."""
 
     def __init__(self, address: str, vehicle: str) -> None:
         host, _, port = address.rpartition(":")
@@ -89,8 +89,8 @@ class Page:
 
 
 def frames(buffer: bytes) -> tuple[int, bytes]:
-    """Returns how many binary messages are whole in the bytes of a server's WebSocket, and what is left behind the last
-    whole one."""
+    """Returns the number of complete binary messages in the bytes of a server's WebSocket, and the bytes after the last
+    complete one."""
     binary, at = 0, 0
     while len(buffer) - at >= 2:
         length, begin = buffer[at + 1] & 0x7F, at + 2
@@ -105,7 +105,7 @@ def frames(buffer: bytes) -> tuple[int, bytes]:
 
 
 def serve(program: str, arena: Path, vehicles: int, pages: int, seconds: float) -> Taken:
-    """Serves an arena with so many vehicles, and so many pages open, each on the next vehicle."""
+    """Serves an arena with `vehicles` vehicles and `pages` open pages, distributed over the vehicles."""
     names = [f"v{number}" for number in range(vehicles)]
     command = [program, "serve", str(arena), "--quic", "127.0.0.1:0", "--http", "127.0.0.1:0", "--pose",
                "json:127.0.0.1:0", "--renderer", "cpu", "--lifeline", "--json"]
@@ -122,7 +122,7 @@ def serve(program: str, arena: Path, vehicles: int, pages: int, seconds: float) 
 
 
 def watch(server: machine.Watched, sender: Sender, pages: list[Page], seconds: float) -> Taken:
-    """Reads what all pages are sent; the first second, in which caches fill, does not count."""
+    """Reads the data of all pages; skips the first second, in which caches fill."""
     with selectors.DefaultSelector() as selector:
         for page in pages:
             selector.register(page.socket, selectors.EVENT_READ, page)
@@ -147,7 +147,7 @@ def read(selector: selectors.BaseSelector, seconds: float) -> None:
 
 
 def open_pages(address: str, vehicle: str, pages: int) -> None:
-    """Watches a server that may be yet to start, until it ends."""
+    """Opens pages on a server that may not have started yet, and reads until it ends."""
     deadline = time.monotonic() + 60
     while True:
         try:

@@ -1,11 +1,11 @@
-"""Films a generated hall, captures it, and holds the twin against the truth of the film.
+"""Films a generated hall, captures it, and compares the twin with the true scene.
 
     python compare.py VIZFLYT [--replay] [FOLDER]
 
---replay takes the recorded poses of the film, which pycolmap found once; without, pycolmap finds new ones, which vary
-from run to run. FOLDER, if given, keeps what is made. The bars are those of a metric twin: 95 % of the pictures placed,
-scale within 0.3 %, up within 0.2 degrees, camera centres within 2 cm; of a fifth of the pictures, unchosen, half a
-centimetre more.
+--replay takes recorded poses of the film, which pycolmap computed once; otherwise pycolmap computes new ones, which
+vary from run to run. FOLDER, if given, keeps the files. The bounds are those of a metric twin: 95 % of the pictures
+placed, scale within 0.3 %, up within 0.2 degrees, camera centres within 2 cm; half a centimetre more with a fifth of
+the pictures, sampled at a fixed rate.
 """
 
 import json
@@ -35,7 +35,7 @@ def run(vizflyt: str, *args: str, cwd: Path) -> tuple[int, str]:
 
 
 def similarity(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation and translation that bring `found` closest to `true`, N x 3 each (Umeyama 1991)."""
+    """Returns scale, rotation and translation that fit `found` to `true`, N x 3 each (Umeyama 1991)."""
     mean_found, mean_true = found.mean(0), true.mean(0)
     left, values, right = np.linalg.svd((true - mean_true).T @ (found - mean_found))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
@@ -45,7 +45,7 @@ def similarity(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, 
 
 
 def compare(capture: dict, truth: dict) -> dict[str, float]:
-    """How far the pictures' places are from the truth, as they are and when they are aligned first."""
+    """Returns the errors of the pictures' positions, before and after alignment."""
     way = capture["metric"]["way"]
     found = np.array([placed["position_m"] for placed in way])
     frames = [round(placed["at_s"] * RATE_HZ) for placed in way]
@@ -67,7 +67,7 @@ def compare(capture: dict, truth: dict) -> dict[str, float]:
 
 def main(vizflyt: str, home: Path) -> None:
     vizflyt = str(Path(vizflyt).resolve())
-    # A fifth of the video's pictures is rendered, in a fifth of its time.
+    # Renders a fifth of the video's pictures, in a fifth of the time.
     film = ["scene", "generate", "room", "--seed", "3", "--tags", "--capture", "film", "--frames", str(FRAMES)]
     code, _ = run(vizflyt, *film, cwd=home)
     check("a hall is filmed", code == 0)
@@ -77,8 +77,8 @@ def main(vizflyt: str, home: Path) -> None:
     small = ["--python", sys.executable, "--steps", "60", "--splats", "5000", "--width", "160"]
     capture = ["scene", "capture", "hall.mp4", "-o", "hall", "--camera", "film/camera.toml", *small]
 
-    # Pictures at a fixed pace are more blurred than the sharpest of each time, and may be refused: what is asked is
-    # whether they are where they are said to be.
+    # Pictures at a fixed rate are more blurred than the sharpest ones, and may be refused: only the accuracy of their
+    # positions is tested.
     run(vizflyt, *capture, "--tags", "film/tags.toml", "--force", cwd=home)
     made = json.loads((home / "hall/capture.json").read_text())
     check("it is captured", bool(made["finished"]) and (home / "hall/arena.toml").is_file())
@@ -100,12 +100,12 @@ def main(vizflyt: str, home: Path) -> None:
     _, said = run(vizflyt, *capture, "--tags", "film/tags.toml", "--force", cwd=home)
     check("again, all is kept", said.count("(kept)") == 6)
 
-    # The same pictures and poses; nobody measured where the tags stand.
+    # The same pictures and poses, without measured positions of the tags.
     _, said = run(vizflyt, *capture, "--tag-size", "0.24", "--force", cwd=home)
     by_size = json.loads((home / "hall/capture.json").read_text())
     off = compare(by_size, truth)
     check("poses are kept where only the room's measures change", said.count("(kept)") == 3)
-    # Blur moves the corners of a small tag towards its middle: the bound says so.
+    # Blur moves the corners of a small tag towards its centre; the bound includes this.
     bound = by_size["metric"]["scale_bound"]
     what = f"by the tags' size alone the scale is off by {100 * off['scale']:.2f} %, {100 * bound:.2f} at most"
     check(what, off["scale"] <= bound <= 0.03)
@@ -117,7 +117,7 @@ def main(vizflyt: str, home: Path) -> None:
     check("and it is refused", code != 0 and "REFUSED" in said and not (home / "hall/arena.toml").exists())
 
 
-# Of a walk of 50 s: two for each picture that is taken.
+# For a walk of 50 s: two frames for each picture taken.
 FRAMES, RATE_HZ = 300, 6
 
 if __name__ == "__main__":

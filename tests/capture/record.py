@@ -1,10 +1,10 @@
-"""Records the poses that pycolmap has found, for tests that must not depend on a new run of it.
+"""Records poses computed by pycolmap, for tests that must not depend on a new run of it.
 
     python record.py HALL FILM_RATE_HZ MODEL
 
-HALL is the output of `vizflyt scene capture` for a film's video. Writes a COLMAP model as text to the folder MODEL: the
-pictures are named as the film's own, and a random part of the points is kept. The longest tracks only would leave out
-the floor.
+HALL is the output of `vizflyt scene capture` for a film's video. Writes a COLMAP model as text to the folder MODEL,
+with the film's names of the pictures and a random part of the points. A selection of the longest tracks would omit the
+floor.
 """
 
 import json
@@ -24,7 +24,7 @@ def main(hall: Path, rate_hz: float, target: Path) -> None:
     found = json.loads((hall / "stages/poses.json").read_text())["result"]["models"][0]["folder"]
     model = pycolmap.Reconstruction(hall.parent / found)
     images = sorted(model.images.values(), key=lambda image: image.name)
-    # Points that only two pictures see say little.
+    # Points seen by only two pictures carry little information.
     points = [(point_id, point) for point_id, point in sorted(model.points3D.items()) if point.track.length() > 2]
     random.Random(1).shuffle(points)
     counts = {image.image_id: 0 for image in images}

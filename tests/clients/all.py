@@ -1,9 +1,9 @@
-"""Runs every client against a simulator of its own, all at once, and then each through a bridge of its
-own; prints what they print, and how many checks passed.
+"""Flies every MAVLink client against its own simulator, all in parallel, and then each one through its own bridge;
+prints the output of each client and the number of passed checks.
 
-Usage: all.py [--soak SECONDS] COMMAND...   (what starts the simulator)
-    The bridge is `vizflyt bridge emulate`; vizflyt lies beside COMMAND.
-    --soak    instead: so long through the bridge, whose memory must stay as it was
+Usage: all.py [--soak SECONDS] COMMAND...   (COMMAND starts the simulator)
+    The bridge is `vizflyt bridge emulate`, from the folder of COMMAND.
+    --soak    instead: run for SECONDS through the bridge, whose memory must not grow
 """
 
 import json
@@ -17,15 +17,15 @@ from bridge import Rig
 from square import Checks
 
 HERE = os.path.dirname(os.path.abspath(__file__))
-# Nothing here takes half as long, however loaded the machine is. [s]
+# Timeout of one client; more than twice the time that any needs on a loaded machine. [s]
 LIMIT = 400
-# A client, and how it writes the address of a TCP server.
+# Client, and its notation for the address of a TCP server.
 SQUARES = [
     ("square_pymavlink.py", "tcp:%s"),
     ("square_mavproxy.py", "tcp:%s"),
     ("square_mavsdk.py", "tcpout://%s"),
 ]
-# The same through a bridge: over UDP, or TCP.
+# The same clients through a bridge: over UDP or TCP.
 BRIDGED = [
     ("square_pymavlink.py", "udpout:%s", "udp"),
     ("square_mavproxy.py", "tcp:%s", "tcp"),
@@ -44,7 +44,7 @@ def python(script, *args, **options):
 
 
 def square(command, script, address, seed, results):
-    """Flies one client on a simulator with two links: one for what a net gives, one for it."""
+    """Flies one client on a simulator with two links: one for the feed of poses, one for the client."""
     feed = python("feed.py", "0", "-", stdin=subprocess.PIPE)
     vicon = feed.stdout.readline().strip()
     endpoints = ["--mavlink", "udpin:127.0.0.1:0", "--mavlink", "tcpin:127.0.0.1:0"]
@@ -68,7 +68,7 @@ def square(command, script, address, seed, results):
             lines.append(line)
         status = client.wait()
         watchdog.cancel()
-        # What the referee saw: it flew a square of four metres, and landed.
+        # The simulator's own record: the vehicle flew a square of four metres and landed.
         simulator.stdin.close()
         report = [json.loads(line) for line in simulator.stdout][-1]["report"]
         good = report["landed"] and report["path_m"] > 5.0
@@ -82,7 +82,7 @@ def square(command, script, address, seed, results):
 
 
 def bridged(vizflyt, command, row, seed, results):
-    """Flies one client through a bridge, beside a listener that counts and one that never reads."""
+    """Flies one client through a bridge, together with a listener that counts packets and one that never reads."""
     script, address, way = row
     rig = Rig(vizflyt, BAUDS[0], command, seed)
     client = None
@@ -109,7 +109,7 @@ def bridged(vizflyt, command, row, seed, results):
 
 
 def transfers(vizflyt, command, baud, results):
-    """Moves parameters and a mission at one speed."""
+    """Transfers parameters and a mission at one baud rate."""
     client = python("bridge.py", vizflyt, str(baud), *command)
     lines = []
     for line in client.stdout:
@@ -119,13 +119,13 @@ def transfers(vizflyt, command, baud, results):
 
 
 def counted(lines):
-    """Returns how many checks a client reports as passed."""
+    """Returns the number of checks that a client reports as passed."""
     found = re.search(r"(\d+) passed", lines[-1]) if lines else None
     return int(found.group(1)) if found else 0
 
 
 def behaviour(command, results):
-    """The long one, of what an autopilot does and refuses."""
+    """Runs the long check of the autopilot's behaviour and of the commands it refuses."""
     client = python("behaviour.py", *command)
     lines = []
     for line in client.stdout:
@@ -135,7 +135,7 @@ def behaviour(command, results):
 
 
 def together(threads):
-    """Runs threads side by side; returns how many there were."""
+    """Runs threads in parallel; returns their number."""
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -152,7 +152,7 @@ def main():
     if soak:
         args = [*command[:2], vizflyt, str(BAUDS[0]), *command[2:]]
         return subprocess.call([sys.executable, os.path.join(HERE, "bridge.py"), *args])
-    # What the simulators say beside, the clients hear anyway.
+    # The clients receive other messages of the simulators by MAVLink.
     os.environ.setdefault("RUST_LOG", "warn")
     results = []
     started = together(
@@ -173,7 +173,7 @@ def main():
         ]
     )
     failed = [script for script, good, _, _ in results if not good]
-    # A thread that ended by an exception has left no result.
+    # A thread that ended with an exception left no result.
     missing = started - len(results)
     passed = sum(count for _, _, count, _ in results)
     print("%d checks passed; failed: %s" % (passed, ", ".join(failed) or "none"))

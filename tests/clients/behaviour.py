@@ -1,8 +1,8 @@
-"""Flies the simulator as a companion computer would: refusals, take-off, a square, setpoints that
-time out, landing. Feeds external navigation from the simulator's own Vicon stream, which it reads
-by itself. Prints one line a check and a count at the end; exit status 0 only if all passed.
+"""Flies the simulator as a companion computer would: refused commands, take-off, a square, setpoints that time out,
+landing. Feeds external navigation from the simulator's Vicon stream with its own reader. Prints one line for each check
+and a count at the end; the exit status is 0 only if all checks passed.
 
-Usage: fly_square.py COMMAND...   (what starts the simulator)
+Usage: behaviour.py COMMAND...   (COMMAND starts the simulator)
 """
 
 import math
@@ -189,7 +189,7 @@ def fly_velocities(lab):
     start = lab.vicon.pose[:3]
     lab.fly_for(3)
     check("and stays there", math.dist(start, lab.vicon.pose[:3]) < 0.15)
-    # Yaw ignored: the pitfall that every companion must know.
+    # Yaw ignored: a common mistake of companion programs.
     lab.setpoint = 0xDC7, (0, 0, 0, -1.0, 0, 0, 0, 0, 0, 0, 0)
     lab.fly_for(1)
     lab.setpoint = 0xDC7, (0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 0)

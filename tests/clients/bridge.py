@@ -1,9 +1,9 @@
-"""A simulated vehicle behind the bridge's own program (`vizflyt bridge emulate`): a serial line of a real
-speed on one side, stations on the other, one of which never reads. Counts what a station counts.
+"""Tests `vizflyt bridge emulate` with a simulated vehicle: a serial line at a real baud rate on one side, ground
+stations on the other, one of which never reads. Counts received and lost packets as a station does.
 
 Usage: bridge.py [--soak SECONDS] VIZFLYT BAUD COMMAND...     COMMAND starts the simulator
-    Without --soak: loads all parameters, sends a mission and reads it back, while another client
-    stalls. With it: stays as long, and the bridge's memory must stay as it was.
+    Without --soak: loads all parameters, sends a mission and reads it back while another client
+    stalls. With --soak: runs for SECONDS; the bridge's memory must not grow.
 """
 
 import json
@@ -20,21 +20,22 @@ from lab import mavlink, mavutil
 from square import Checks, until
 
 HERE = os.path.dirname(os.path.abspath(__file__))
-# Below this a vehicle slows its streams (ArduPilot's GCS_MAVLINK::handle_radio_status: 20 and 50; back at 90).
+# Below this free buffer a vehicle slows its streams (ArduPilot's GCS_MAVLINK::handle_radio_status: 20 and 50; back at
+# 90).
 ROOM = 90
-# ATTITUDE and LOCAL_POSITION_NED, 50 Hz: what a companion flies by.
+# ATTITUDE and LOCAL_POSITION_NED at 50 Hz, which a companion computer needs to fly.
 STREAMS = [30, 32]
-# A client that takes nothing is dropped before the listener has received this many more packets. The bridge waits 5 s,
-# some 500 packets; the rest is for the kernel's buffers and for the client's hello of each second.
+# A client that reads nothing must be dropped before the listener has received this many more packets. The bridge's
+# timeout is 5 s, about 500 packets; the rest covers the kernel's buffers and the client's heartbeat each second.
 DROPPED_WITHIN = 6000
-# Nothing comes any more: given up after this long. [s]
+# Timeout for a connection that receives nothing. [s]
 HANGS = 300
-# Memory of a program that does the same all the time: pages of its heap come and go. [KiB]
+# Tolerance for a program in steady state, whose heap pages come and go. [KiB]
 GROWTH_KIB = 512
 
 
 class Watcher:
-    """A ground station that only listens, all the while: pymavlink's own count of what it has lost."""
+    """A ground station that only listens; pymavlink counts the lost packets."""
 
     def __init__(self, address):
         self.link = mavutil.mavlink_connection(
@@ -77,12 +78,12 @@ class Watcher:
 
 
 class Stalled:
-    """A TCP client that says hello every second, as every station does, and never reads."""
+    """A TCP client that sends a heartbeat every second, as every station does, and never reads."""
 
     def __init__(self, address):
         host, port = address.split(":")
         self.socket = socket.socket()
-        # What the kernel would read for it is kept small.
+        # Keep the kernel's receive buffer small.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         self.socket.connect((host, int(port)))
         self.mav = mavlink.MAVLink(None, srcSystem=249, srcComponent=190)
@@ -91,9 +92,8 @@ class Stalled:
         self.is_dropped()
 
     def is_dropped(self):
-        """Whether the bridge has ended the connection; nothing is read. The reset that ends it may lie
-        behind what this side's full window has refused, and the kernel passes over such a one
-        (RFC 5961): a client learns of it when it next speaks."""
+        """Returns whether the bridge has closed the connection, without reading. The RST may lie beyond this side's
+        full receive window, and the kernel ignores such an RST (RFC 5961): a client notices it with its next send."""
         if self.dropped:
             return True
         if time.monotonic() - self.beat > 1:
@@ -110,7 +110,7 @@ class Stalled:
 
 
 class Rig:
-    """The bridge, the vehicle on its serial line, the pose that a net gives it, and a stalled client."""
+    """The bridge, the vehicle on its serial line, its pose feed, and a stalled client."""
 
     def __init__(self, vizflyt, baud, command, seed):
         self.folder = tempfile.TemporaryDirectory()
@@ -143,10 +143,10 @@ class Rig:
         return process, json.loads(process.stdout.readline())
 
     def judge(self, check):
-        """What every station must be able to say in the end."""
+        """Checks what every station must have received at the end."""
         watcher = self.watcher
         until(lambda: len(watcher.rooms) > 3, HANGS)
-        # Measured by what the bridge has sent to others, not by a clock: a starved bridge sends and drops later.
+        # Measured in packets sent to others instead of time: a bridge without processor time sends and drops later.
         end = watcher.link.mav_count + DROPPED_WITHIN
         until(lambda: self.stalled.is_dropped() or watcher.link.mav_count > end, HANGS)
         check("the client that never reads was dropped", self.stalled.dropped)
@@ -156,7 +156,7 @@ class Rig:
         check("nobody was throttled: room never below %d %%" % min(rooms), min(rooms) >= ROOM, rooms)
 
     def report(self):
-        """Ends the simulator and the bridge; returns the report of each."""
+        """Stops the simulator and the bridge; returns the report of each."""
         reports = []
         for process in (self.simulator, self.bridge):
             process.stdin.close()
@@ -173,7 +173,7 @@ class Rig:
 
 
 class Station:
-    """A pymavlink station that asks for things."""
+    """A pymavlink station that sends requests."""
 
     def __init__(self, address):
         self.link = mavutil.mavlink_connection("udpout:%s" % address, source_system=251)
@@ -213,7 +213,7 @@ class Station:
         return until(done, seconds, self.work)
 
     def load_params(self):
-        """The list as every station asks for it; what is missing is asked for again, by its place."""
+        """Loads the parameter list as every station does: missing parameters are requested again by index."""
         start = time.monotonic()
         self.link.mav.param_request_list_send(1, 1)
         whole = lambda: self.params and len(self.params) == next(iter(self.params.values()))
@@ -221,14 +221,14 @@ class Station:
         return bool(whole()), len(self.params), time.monotonic() - start
 
     def asks_ftp(self):
-        """Whether anybody answers for files."""
+        """Returns whether any component answers MAVLink FTP."""
         name = b"@PARAM/param.pck"
         payload = bytes([0, 0, 0, 4, len(name), 0, 0, 0, 0, 0, 0, 0]) + name
         self.link.mav.file_transfer_protocol_send(0, 1, 1, payload.ljust(251, b"\0"))
         return self.until(lambda: self.ftp, 3)
 
     def send_mission(self, points, kind, command):
-        """Sends items one by one, as they are asked for; returns the answer."""
+        """Sends mission items one by one as they are requested; returns the acknowledgement."""
         self.requests.clear()
         self.acks.clear()
         mav = self.link.mav
@@ -245,7 +245,7 @@ class Station:
         return self.acks[0] if self.acks else None
 
     def read_mission(self, kind):
-        """Asks for the items, one by one; returns where they are."""
+        """Requests the items one by one; returns their positions."""
         self.items.clear()
         mav = self.link.mav
         mav.mission_request_list_send(1, 1, kind)
@@ -261,7 +261,7 @@ class Station:
 
 
 def transfers(check, rig):
-    """Parameters and a mission, as ground stations move them."""
+    """Transfers parameters and a mission as ground stations do."""
     station = Station(rig.udp)
     alive = lambda: "HEARTBEAT" in rig.watcher.newest
     check("connects", until(alive, 30))
@@ -276,7 +276,7 @@ def transfers(check, rig):
     check("a mission of %d items is taken" % len(points), sent == mavlink.MAV_MISSION_ACCEPTED, sent)
     read = station.read_mission(fence)
     check("and comes back as it was", read == points, read[:3])
-    # Whoever is away for a while loses what passes meanwhile: only the listener's loss is judged.
+    # A station that pauses loses the packets of that time: only the listener's loss is checked.
     check("the station that asked lost none", station.link.mav_loss == 0, station.link.mav_loss)
 
 
@@ -286,7 +286,7 @@ def memory_kib(process):
 
 
 def soak(check, rig, seconds):
-    """Stays for a while; the bridge's memory must not grow behind its first minute."""
+    """Runs for `seconds`; the bridge's memory must not grow after the first minute."""
     watcher = rig.watcher
     start = time.monotonic()
     time.sleep(min(60.0, seconds / 2))

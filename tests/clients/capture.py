@@ -1,10 +1,10 @@
-"""Writes the packets that the bridge is tested with, as pymavlink makes them:
-firmware-esp/bridge/tests/data/pymavlink.bin, and what each is in pymavlink.txt; and those of distances to obstacles,
-which ours are held against: protocol/core/src/mavlink/distances.txt.
+"""Writes the packets for the bridge's tests with pymavlink: firmware-esp/bridge/tests/data/pymavlink.bin, with their
+contents in pymavlink.txt; and reference packets of obstacle distances, protocol/core/src/mavlink/distances.txt.
 
     target/clients/bin/python tests/clients/capture.py
 
-Every message of the dialect once, small fields set and floats not, some as MAVLink 1, some signed.
+Every message of the dialect once, with small values in integer fields and fractions in float fields; some as MAVLink 1,
+some signed.
 """
 
 import math
@@ -15,12 +15,12 @@ from pymavlink.dialects.v20 import ardupilotmega as v2
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "firmware-esp/bridge/tests/data"
-# MANUAL_CONTROL calls its target system otherwise.
+# MANUAL_CONTROL has another name for its target system.
 SYSTEM = {69: "target"}
 
 
 def value(index, kind, length):
-    """Returns a value that shows where it went: the target fields differ from the rest."""
+    """Returns a value that identifies its position; the target fields differ from the rest."""
     if kind == "char":
         return ("text%d" % index).encode()[:length] if length else b"x"
     number = 1.5 if kind in ("float", "double") else 3 + index % 100
@@ -41,8 +41,8 @@ def message(dialect, cls, index):
 
 
 def distances():
-    """Returns, as hexadecimal, what a range finder that looks down, a sonar that looks 20 degrees below the nose and a
-    LiDAR with walls ahead and to the right are to send."""
+    """Returns the packets, in hexadecimal, of a range finder that looks down, a sonar that looks 20 degrees below the
+    nose, and a LiDAR with walls ahead and to the right."""
     link = v2.MAVLink(None, srcSystem=1, srcComponent=191)
     half = math.radians(-20) / 2
     nowhere = [1201] * 72

@@ -1,11 +1,10 @@
-"""Feeds a vehicle what a net gives it: an origin once, and its pose by motion capture 50 times a
-second as external navigation. A vehicle that has GPS, or one that ArduPilot simulates, needs none of
-it.
+"""Feeds a vehicle what it needs to fly in a net: an EKF origin once, and its motion-capture pose 50 times a second as
+external navigation. A vehicle with GPS, or one simulated by ArduPilot, does not need it.
 
 Usage: feed.py VICON_PORT CONNECTION
-    VICON_PORT  UDP port where the motion capture's object stream comes in; 0 takes a free one,
-                whose address is printed
-    CONNECTION  the vehicle, as pymavlink writes it; from standard input if it is "-"
+    VICON_PORT  UDP port that receives the motion capture's object stream; 0 takes a free port
+                and prints its address
+    CONNECTION  the vehicle, in pymavlink's notation; read from standard input if it is "-"
 """
 
 import sys
@@ -13,7 +12,7 @@ import time
 
 from lab import ORIGIN, Vicon, matrix, mavlink, mavutil, ned_euler
 
-# As a companion computer on board: its heartbeats are no ground station's.
+# An onboard companion computer, so that its heartbeats do not count as a ground station's.
 SYSTEM, COMPONENT = 1, mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 
 
@@ -30,7 +29,7 @@ def main():
     origin = False
     while True:
         now = time.monotonic()
-        # Also tells a vehicle that waits for datagrams where we are.
+        # The packet also gives a vehicle that waits for datagrams the address of this process.
         if now - asked > 1:
             asked = now
             link.mav.heartbeat_send(

@@ -1,7 +1,7 @@
 """The lab as an independent client sees it: one MAVLink link, one Vicon stream.
 
-World axes are x east, y north, z up; MAVLink's are north-east-down. The conversions here are
-written out on their own, so that they check ours.
+World axes are x east, y north, z up; MAVLink's are north-east-down. The conversions are implemented here independently
+of the code under test.
 """
 
 import json
@@ -15,11 +15,11 @@ import time
 from collections import Counter
 
 os.environ["MAVLINK20"] = "1"
-from pymavlink import mavutil  # reads MAVLINK20 when it is imported
+from pymavlink import mavutil # reads MAVLINK20 at import
 
 mavlink = mavutil.mavlink
 
-# An EKF origin: latitude, longitude [1e-7 deg], altitude [mm]. Any place on Earth will do.
+# An EKF origin: latitude, longitude [1e-7 deg], altitude [mm]. The value is arbitrary.
 ORIGIN = (423000000, -718000000, 100000)
 
 # u32 frame, u8 items; per item u8 id, u16 size, char[24] name, f64 x y z [mm], f64 rx ry rz [rad].
@@ -28,7 +28,7 @@ VICON_ITEM = struct.Struct("<BH24s6d")
 
 
 def matrix(rx, ry, rz):
-    """Returns Rz(rz) Ry(ry) Rx(rx): turns about fixed x, then fixed y, then fixed z."""
+    """Returns Rz(rz) Ry(ry) Rx(rx): rotations about fixed x, then fixed y, then fixed z."""
     cx, sx, cy, sy, cz, sz = (f(a) for a in (rx, ry, rz) for f in (math.cos, math.sin))
     return [
         [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
@@ -50,7 +50,7 @@ class Vicon:
 
     def __init__(self, port=0):
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        # A given port is a motion capture's in the lab, which sends from elsewhere.
+        # A given port belongs to the lab's motion capture, which sends from another computer.
         self.socket.bind(("0.0.0.0" if port else "127.0.0.1", port))
         self.socket.setblocking(False)
         self.address = "127.0.0.1:%d" % self.socket.getsockname()[1]
@@ -60,7 +60,7 @@ class Vicon:
         self.pose = None
 
     def read(self):
-        """Takes what has come; returns whether there is a new pose."""
+        """Reads the received packets; returns whether there is a new pose."""
         new = False
         while True:
             try:
@@ -78,7 +78,7 @@ class Vicon:
 
 
 class Lab:
-    """A running simulator with everything a companion computer does in the background."""
+    """A running simulator with the background tasks of a companion computer."""
 
     def __init__(self, command, endpoint, *options):
         """Starts `command`; `endpoint` is "udpout" (the simulator sends first) or "tcpin"."""
@@ -95,7 +95,7 @@ class Lab:
             stdout=subprocess.PIPE,
             text=True,
         )
-        # A simulator that hangs must not hang the test.
+        # Kill a simulator that hangs, so that the test ends.
         self.watchdog = threading.Timer(300, self.process.kill)
         self.watchdog.start()
         self.ready = json.loads(self.process.stdout.readline())
@@ -122,7 +122,7 @@ class Lab:
         return True
 
     def work(self):
-        """Does what is due, then waits at most 5 ms for the next message."""
+        """Sends what is due, then waits at most 5 ms for the next message."""
         mav = self.link.mav
         if self.vicon.read() and self.vision and self.is_due("vision", 0.02):
             x, y, z, rx, ry, rz = self.vicon.pose
@@ -152,7 +152,7 @@ class Lab:
             self.local_times.append(message.time_boot_ms)
 
     def until(self, seconds, done):
-        """Works until `done()` or for `seconds`; returns whether it was done."""
+        """Works until `done()` is true or `seconds` have passed; returns whether it was true."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if done():
@@ -161,16 +161,16 @@ class Lab:
         return bool(done())
 
     def boot_ms(self):
-        """Returns the newest time of the autopilot's own clock."""
+        """Returns the newest time of the autopilot's clock. [ms]"""
         return max(m.time_boot_ms for m in self.newest.values() if hasattr(m, "time_boot_ms"))
 
     def fly_for(self, seconds):
-        """Works until the autopilot's clock has gone on by `seconds`."""
+        """Works until the autopilot's clock has advanced by `seconds`."""
         start = self.boot_ms()
         return self.until(seconds * 4 + 5, lambda: self.boot_ms() - start >= seconds * 1000)
 
     def command(self, number, *params):
-        """Sends COMMAND_LONG; returns the result of its acknowledgement, or None."""
+        """Sends COMMAND_LONG; returns the result in its acknowledgement, or None."""
         self.acks.clear()
         self.link.mav.command_long_send(1, 1, number, 0, *params, *[0] * (7 - len(params)))
         self.until(3, lambda: any(a.command == number for a in self.acks))
@@ -184,25 +184,25 @@ class Lab:
 
     @staticmethod
     def position(x, y, z, yaw_ned):
-        """A position with yaw, from world axes."""
+        """Returns a position setpoint with yaw, from world axes."""
         return 0x9F8, (y, x, -z, 0, 0, 0, 0, 0, 0, yaw_ned, 0)
 
     @staticmethod
     def velocity(vx, vy, vz, yaw_ned):
-        """A velocity with yaw, from world axes."""
+        """Returns a velocity setpoint with yaw, from world axes."""
         return 0x9C7, (0, 0, 0, vy, vx, -vz, 0, 0, 0, yaw_ned, 0)
 
     def distance(self, x, y, z):
-        """Distance of the true pose from a point."""
+        """Returns the distance of the true position from a point. [m]"""
         return math.dist(self.vicon.pose[:3], (x, y, z))
 
     def local(self):
-        """The autopilot's position in world axes."""
+        """Returns the autopilot's position in world axes. [m]"""
         m = self.newest["LOCAL_POSITION_NED"]
         return m.y, m.x, -m.z
 
     def speed(self):
-        """The autopilot's horizontal speed."""
+        """Returns the autopilot's horizontal speed. [m/s]"""
         m = self.newest["LOCAL_POSITION_NED"]
         return math.hypot(m.vx, m.vy)
 
@@ -219,7 +219,7 @@ class Lab:
         return any(words in text for text in self.texts)
 
     def close(self):
-        """Ends the simulator by its lifeline; returns its report and exit status."""
+        """Stops the simulator by closing its standard input; returns its report and exit status."""
         self.process.stdin.close()
         lines = [json.loads(line) for line in self.process.stdout]
         status = self.process.wait()

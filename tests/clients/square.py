@@ -1,8 +1,8 @@
-"""What the three clients have in common: the flight, and how it is judged.
+"""The flight that the three clients share, and its checks.
 
-A client connects, waits until the vehicle may fly, arms, takes off, flies a square and lands. It is
-judged by what the vehicle itself reports, so that the same script runs against the simulator, ArduPilot's
-own simulation, and a vehicle in a net (with its propellers off until you trust it).
+A client connects, waits until the vehicle is ready, arms, takes off, flies a square and lands. The checks use the
+vehicle's own telemetry, so that the same script runs against the simulator, ArduPilot's simulation, and a vehicle in a
+net (without propellers for the first attempts).
 """
 
 import math
@@ -11,11 +11,11 @@ import time
 
 # Height above the ground, and side of the square. [m]
 HEIGHT, SIDE = 1.2, 1.0
-# A corner counts as reached this near, and this slow. [m], [m/s]
+# Maximum distance and speed at which a corner counts as reached. [m], [m/s]
 NEAR, SLOW = 0.2, 0.25
 # Corners from the start: north and east. [m]
 CORNERS = [(SIDE, 0), (SIDE, SIDE), (0, SIDE), (0, 0)]
-# Any step may take this long; ArduCopter without GPS is ready after some 15 s, with it after 45. [s]
+# Timeout of each step; ArduCopter is ready after about 15 s without GPS, and after 45 s with GPS. [s]
 PATIENCE = 120.0
 
 
@@ -33,7 +33,7 @@ class Checks:
         more = "" if good or detail == "" else "  (%s)" % (detail,)
         print("%s  %s: %s%s" % ("ok  " if good else "FAIL", self.client, name, more), flush=True)
         if not good and not self.keeps_going:
-            # What comes next would only fail for the same reason.
+            # The following checks would only fail for the same reason.
             self.end()
 
     def end(self):
@@ -42,7 +42,7 @@ class Checks:
 
 
 def until(done, seconds=PATIENCE, work=lambda: time.sleep(0.02)):
-    """Works until `done()`; returns whether it came to that within `seconds`."""
+    """Works until `done()` is true; returns whether it was true within `seconds`."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if done():
@@ -52,5 +52,5 @@ def until(done, seconds=PATIENCE, work=lambda: time.sleep(0.02)):
 
 
 def reached(position, speed, target):
-    """Whether the vehicle stands at a target (north, east, height)."""
+    """Returns whether the vehicle is stationary at a target (north, east, height)."""
     return math.dist(position, target) < NEAR and speed < SLOW

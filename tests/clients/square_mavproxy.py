@@ -1,9 +1,9 @@
-"""Flies a square with MAVProxy: its own prompt is typed at, as a person would, and the vehicle is
-watched over an output that MAVProxy forwards to.
+"""Flies a square with MAVProxy: types commands at its prompt, and monitors the vehicle over an output that MAVProxy
+forwards to.
 
 Usage: square_mavproxy.py CONNECTION [--lossless]
     CONNECTION  for example tcp:127.0.0.1:5760, udp:127.0.0.1:14550
-    --lossless  a link that must lose nothing, as MAVProxy counts
+    --lossless  also check that MAVProxy counts no lost packet
 """
 
 import math
@@ -57,7 +57,7 @@ class Proxy:
             message = self.watch.recv_match(blocking=False)
 
     def until(self, done, line=None, seconds=120.0, every=3.0):
-        """Works until `done()`, typing `line` every few seconds until then."""
+        """Works until `done()` is true, and types `line` every `every` seconds until then."""
         typed = [0.0]
 
         def work():
@@ -97,7 +97,7 @@ def fly(check, proxy):
     got_all = lambda: any("Received" in line and "parameters" in line for line in proxy.lines)
     check("reads the parameters", proxy.until(got_all), proxy.lines[-5:])
     check("becomes ready", proxy.until(proxy.ready), proxy.lines[-5:])
-    # Its `position` ignores yaw: the nose must not turn into travel (pitfall 4).
+    # MAVProxy's `position` ignores yaw: the nose must not turn in the direction of travel (pitfall 4).
     proxy.type("param set WP_YAW_BEHAVIOR 0")
     check("GUIDED", proxy.until(lambda: proxy.mode() == 4, "mode GUIDED"), proxy.lines[-5:])
     check("arms", proxy.until(proxy.armed, "arm throttle"), proxy.lines[-5:])
@@ -108,7 +108,7 @@ def fly(check, proxy):
     sin, cos = math.sin(proxy.yaw()), math.cos(proxy.yaw())
     for number, (dx, dy) in enumerate(CORNERS, 1):
         target = (north + dx, east + dy, ground + HEIGHT)
-        # `position` takes metres ahead, right and down from where the vehicle is.
+        # `position` takes metres ahead, right and down, relative to the vehicle.
         x, y, z = (a - b for a, b in zip(target, proxy.position()))
         proxy.type("position %.3f %.3f %.3f" % (x * cos + y * sin, y * cos - x * sin, -z))
         there = lambda: reached(proxy.position(), proxy.speed(), target)
@@ -119,7 +119,7 @@ def fly(check, proxy):
 
 
 def lost(proxy):
-    """Returns what MAVProxy's `link` says of packets lost; None if it says nothing."""
+    """Returns the lost packets that MAVProxy's `link` reports, or None without a report."""
 
     def found():
         lines = [re.search(r"(\d+) lost", line) for line in proxy.lines]

@@ -1,4 +1,4 @@
-"""Flies a square with MAVSDK, whose C++ library the package mavsdk 4 brings.
+"""Flies a square with MAVSDK; the package mavsdk 4 contains its C++ library.
 
 Usage: square_mavsdk.py CONNECTION [--lossless]      for example tcpout://127.0.0.1:5760, udpin://0.0.0.0:14540
 """
@@ -15,7 +15,7 @@ from mavsdk.plugins.telemetry import Telemetry
 
 
 def tried(act, *params):
-    """Runs `act`; returns what went wrong, or nothing."""
+    """Runs `act`; returns the error, or nothing."""
     try:
         act(*params)
         return ""
@@ -24,11 +24,11 @@ def tried(act, *params):
 
 
 def main():
-    # It counts no loss: whoever listens beside it does.
+    # MAVSDK counts no lost packets: a parallel listener does.
     if len(sys.argv) != 2 + (sys.argv[2:] == ["--lossless"]):
         sys.exit(__doc__)
     check = Checks("mavsdk")
-    # As a ground station whose heartbeats the autopilot counts.
+    # A ground station, so that the autopilot counts its heartbeats.
     sdk = Mavsdk(Configuration.create_manual(255, 190, True))
     result = sdk.add_any_connection(sys.argv[1])
     check("opens %s" % sys.argv[1], result == ConnectionResult.SUCCESS, result)
@@ -45,8 +45,7 @@ def main():
         v = telemetry.position_velocity_ned().velocity
         return math.hypot(v.north_m_s, v.east_m_s, v.down_m_s)
 
-    # MAVSDK's own health asks for GPS; arming itself shows whether the vehicle is ready, once there
-    # is a position to hold.
+    # MAVSDK's health check requires GPS; arming shows whether the vehicle is ready, as soon as it has a position.
     known = lambda: not any(math.isnan(v) for v in position())
     check("position comes", until(known))
     north, east, ground = position()

@@ -2,7 +2,7 @@
 
 Usage: square_pymavlink.py CONNECTION [--lossless]
     CONNECTION  for example tcp:127.0.0.1:5760, udpin:0.0.0.0:14550
-    --lossless  a link that must lose nothing, as pymavlink counts
+    --lossless  also check that pymavlink counts no lost packet
 """
 
 import math
@@ -18,7 +18,7 @@ GUIDED, LAND = 4, 9
 
 
 class Vehicle:
-    """The newest message of every kind, and our heartbeat once a second."""
+    """Holds the newest message of each type, and sends a heartbeat once a second."""
 
     def __init__(self, connection):
         self.link = mavutil.mavlink_connection(connection, source_system=255)
@@ -47,7 +47,7 @@ class Vehicle:
         return until(done, seconds, self.work)
 
     def command(self, number, *params):
-        """Sends a command until it is answered; returns the result."""
+        """Sends a command until it is acknowledged; returns the result."""
         self.acks.pop(number, None)
         padded = [*params, *[0] * (7 - len(params))]
         system = self.newest["HEARTBEAT"].get_srcSystem()
@@ -61,7 +61,7 @@ class Vehicle:
         return all(kind in self.newest for kind in kinds)
 
     def ready(self):
-        """The estimator knows where it is, and the checks are passed."""
+        """Returns whether the estimator has a position and the pre-arm checks passed."""
         if not self.has("EKF_STATUS_REPORT", "SYS_STATUS", "LOCAL_POSITION_NED"):
             return False
         flags = self.newest["EKF_STATUS_REPORT"].flags
@@ -72,7 +72,7 @@ class Vehicle:
         return bool(self.newest["HEARTBEAT"].base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 
     def position(self):
-        """North, east, height. [m]"""
+        """Returns north, east and height. [m]"""
         m = self.newest["LOCAL_POSITION_NED"]
         return m.x, m.y, -m.z
 
@@ -95,7 +95,7 @@ def main():
     check = Checks("pymavlink")
     vehicle = Vehicle(sys.argv[1])
     check("connects", vehicle.until(lambda: vehicle.has("HEARTBEAT")))
-    # What a telemetry port sends by itself differs; every real one needs to be asked.
+    # The default streams of telemetry ports differ, so request them explicitly.
     for number in (mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 193, 1):
         vehicle.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 100000)
     check("becomes ready", vehicle.until(vehicle.ready), vehicle.texts[-5:])

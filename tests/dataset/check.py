@@ -1,4 +1,4 @@
-"""Checks data sets against geometry computed here: projected gates, cast rays, warped images."""
+"""Checks data sets against independently computed geometry: projected gates, cast rays, warped images."""
 
 import json
 import pathlib
@@ -10,7 +10,7 @@ from PIL import Image
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
-# Bars of a racing window: width and thickness, as docs/guides/course.md has them. [m]
+# Bars of a racing window: width and thickness, as in docs/guides/course.md. [m]
 BAR_M, THICK_M = 0.16, 0.09
 
 checks = 0
@@ -39,7 +39,7 @@ def rotation(q: list[float]) -> np.ndarray:
 
 
 def matrix(pose: dict) -> np.ndarray:
-    """4x4, takes points of the second frame to the first."""
+    """Returns the 4x4 matrix that maps points of the second frame to the first."""
     m = np.eye(4)
     m[:3, :3] = rotation(pose["q_xyzw"])
     m[:3, 3] = pose["p_m"]
@@ -47,7 +47,7 @@ def matrix(pose: dict) -> np.ndarray:
 
 
 def rays(camera: dict) -> np.ndarray:
-    """H x W x 3 in cam, z = 1."""
+    """Returns the rays of all pixels, H x W x 3 in cam, z = 1."""
     u, v = np.meshgrid(np.arange(camera["width_px"]) + 0.5, np.arange(camera["height_px"]) + 0.5)
     x = (u - camera["cx_px"]) / camera["fx_px"]
     y = (v - camera["cy_px"]) / camera["fy_px"]
@@ -55,7 +55,8 @@ def rays(camera: dict) -> np.ndarray:
 
 
 def cast_box(origin: np.ndarray, direction: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays in the box's own axes enter it (infinite if never), and the axis whose face they enter by."""
+    """Returns the distance at which rays in the box's axes enter it (infinite for a miss), and the axis of the entry
+    face."""
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1.0 / direction
         low, high = (-half - origin) * inverse, (half - origin) * inverse
@@ -66,7 +67,7 @@ def cast_box(origin: np.ndarray, direction: np.ndarray, half: np.ndarray) -> tup
 
 
 def frame_depth(camera: dict, gate: dict) -> np.ndarray:
-    """Depth of the four bars of a window alone; infinite beside them. [m]"""
+    """Returns the depth of only the four bars of a window; infinite elsewhere. [m]"""
     cam_from_gate = matrix(gate["cam_from_gate"])
     gate_from_cam = np.linalg.inv(cam_from_gate)
     direction = rays(camera) @ gate_from_cam[:3, :3].T
@@ -82,7 +83,7 @@ def frame_depth(camera: dict, gate: dict) -> np.ndarray:
 
 
 def cast(volumes: list, camera: dict, world_from_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """True depth [m] and true normals in cam, of boxes and half spaces."""
+    """Returns true depth [m] and true normals in cam, of boxes and half spaces."""
     direction = rays(camera) @ world_from_cam[:3, :3].T
     eye = world_from_cam[:3, 3]
     depth = np.full(direction.shape[:2], np.inf)
@@ -110,7 +111,7 @@ def cast(volumes: list, camera: dict, world_from_cam: np.ndarray) -> tuple[np.nd
 
 
 def near_edge(mask: np.ndarray, reach: int = 1) -> np.ndarray:
-    """Pixels within `reach` of a change of the mask."""
+    """Returns the pixels within `reach` of a change of the mask."""
     changed = np.zeros_like(mask)
     for dy in range(-reach, reach + 1):
         for dx in range(-reach, reach + 1):
@@ -123,7 +124,7 @@ def png(path: pathlib.Path) -> np.ndarray:
 
 
 def flow_png(path: pathlib.Path) -> np.ndarray:
-    """H x W x 3 of 16 bits: Pillow reads such a PNG as 8 bits, so it is unpacked here (PNG, section 9)."""
+    """Returns a PNG of 16 bits, H x W x 3: Pillow reads it with 8 bits, so it is decoded here (PNG, section 9)."""
     import struct
     import zlib
 
@@ -148,7 +149,7 @@ def flow_png(path: pathlib.Path) -> np.ndarray:
 
 
 def coco_set(folder: pathlib.Path) -> None:
-    """Masks, boxes and corners as pycocotools reads them, against the images and projected gates."""
+    """Checks masks, boxes and corners, read by pycocotools, against the images and projected gates."""
     ious, corners_off, seen, hidden = [], [], 0, 0
     annotations, explained = 0, []
     for split in ("train", "val"):
@@ -172,7 +173,8 @@ def coco_set(folder: pathlib.Path) -> None:
                     continue
                 gate = next(gate for gate in record["gates"] if gate["id"] == annotation["instance"])
                 assert np.allclose(matrix(gate["cam_from_gate"]), matrix(annotation["cam_from_gate"]), atol=1e-12)
-                # The mask: where the bars are, but for what is nearer; pixels at edges are either's.
+                # The mask: pixels of the bars, except those behind nearer objects; pixels at edges may belong to
+                # either.
                 alone = frame_depth(camera, gate)
                 there = np.isfinite(alone)
                 hides = (depth > 0) & (depth < np.where(there, alone, 0) - 0.1)
@@ -183,7 +185,7 @@ def coco_set(folder: pathlib.Path) -> None:
                     either = (expected | mask).sum()
                     if annotation["area"] > 800:
                         ious.append((expected & mask).sum() / either)
-                # The corners, from the pose alone.
+                # The corners, computed from the pose only.
                 y, z = np.array(gate["size_m"]) / 2.0
                 points = np.array([[0, y, z, 1], [0, -y, z, 1], [0, -y, -z, 1], [0, y, -z, 1]])
                 points = (matrix(gate["cam_from_gate"]) @ points.T)[:3].T
@@ -210,7 +212,7 @@ def coco_set(folder: pathlib.Path) -> None:
 
 
 def yolo_set(folder: pathlib.Path) -> None:
-    """Polygons, filled by the even-odd rule, against the images' masks."""
+    """Checks polygons, filled by the even-odd rule, against the images' masks."""
     polygons = 0
     names = [line.split(": ")[1] for line in (folder / "data.yaml").read_text().splitlines() if line.startswith("  ")]
     check("classes of data.yaml", names == ["gate"], names)
@@ -235,7 +237,7 @@ def yolo_set(folder: pathlib.Path) -> None:
 
 
 def true_surfaces(vizflyt: str, folder: pathlib.Path) -> None:
-    """Depth and normals against rays cast at the true solids, and masks of parts named by boxes."""
+    """Checks depth and normals against rays cast at the true solids, and masks of parts defined by boxes."""
     room = folder / "race"
     subprocess.run(
         [vizflyt, "scene", "generate", "race", "--seed", "5", "-o", str(room)], check=True, stdout=subprocess.DEVNULL
@@ -250,7 +252,7 @@ def true_surfaces(vizflyt: str, folder: pathlib.Path) -> None:
         encoded = png(data / f"normals/train/{path.stem}.png").astype(float)
         still = png(data / f"instances/train/{path.stem}.png") == 0
         true_depth, true_normals = cast(truth, record["camera"], matrix(record["world_from_cam"]))
-        # Flat surroundings: not at edges of depth, not beyond the hall's walls, not what moves.
+        # Flat static surfaces: exclude depth edges, pixels beyond the hall's walls, and moving objects.
         slope = np.abs(np.diff(1 / true_depth, 2, axis=0, prepend=0, append=0)) + np.abs(
             np.diff(1 / true_depth, 2, axis=1, prepend=0, append=0)
         )
@@ -277,7 +279,8 @@ def true_surfaces(vizflyt: str, folder: pathlib.Path) -> None:
 
 
 def flow(folder: pathlib.Path) -> None:
-    """Flow of what stands still from depth and poses; what moves, and all the rest, by warping the next image."""
+    """Checks the flow of static surfaces against depth and poses; of moving objects and the rest by warping the next
+    image."""
     off, warped_error, plain_error, moving = [], [], [], []
     for path in sorted((folder / "records/train").glob("*.json")):
         record = json.loads(path.read_text())
@@ -300,7 +303,7 @@ def flow(folder: pathlib.Path) -> None:
             ], axis=-1)
         still = valid & ~is_mover & (depth > 0.3)
         off.append(np.abs(uv - (target - np.stack([u, v], axis=-1)))[still])
-        # The next image, looked up where each pixel goes.
+        # Sample the next image at the target of each pixel.
         x, y = u + uv[..., 0] - 0.5, v + uv[..., 1] - 0.5
         x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
         inside = valid & (x0 >= 0) & (y0 >= 0) & (x0 < camera["width_px"] - 1) & (y0 < camera["height_px"] - 1)

@@ -14,15 +14,15 @@ import sys
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 BLOCK = re.compile(r"^(```|~~~)[^\n]*\n(.*?)^\1", re.M | re.S)
 SPAN = re.compile(r"`(vizflyt [^`\n]+)`")
-# A command line, after a prompt or `sudo`, by the program's name or through cargo.
+# A command line, after a prompt or `sudo`, with the program's name or cargo.
 LINE = re.compile(r"^\s*(?:\$ )?(?:sudo )?(?:vizflyt|\S*/vizflyt|cargo run(?: --release)? --) (.*)$")
-# Templates have names to be filled in; decisions and the changelog may name what is gone.
+# Templates contain placeholders; decisions and the changelog may name removed commands.
 LEFT_OUT = ("jetson/cli/templates/", "docs/decisions/", "docs/CHANGELOG.md")
-# Commands of builds with more features than the everyday one.
+# Commands of builds with more features than the ordinary one.
 OTHER_BUILDS = ("ros2", "crazyflie")
-# Commands that the program starts itself, and does not list.
+# Hidden commands that the program starts itself.
 HIDDEN = ("guardian", "plugin")
-# Options of `vizflyt grade` are given to this one behind its own.
+# This command also accepts options of `vizflyt grade`.
 GRADES = "grade-class"
 
 
@@ -49,7 +49,7 @@ class Program:
 
 
 def lines(text: str) -> list[str]:
-    """Returns what follows `vizflyt` in each command of a document."""
+    """Returns the arguments of `vizflyt` in each command of a document."""
     found = [match[1].removeprefix("vizflyt ") for match in SPAN.finditer(BLOCK.sub("", text))]
     for block in BLOCK.finditer(text):
         for line in block[2].replace("\\\n", " ").splitlines():
@@ -60,11 +60,11 @@ def lines(text: str) -> list[str]:
 
 
 def fault(program: Program, line: str) -> str | None:
-    """Returns what is wrong with a command line."""
+    """Returns the fault of a command line, if any."""
     try:
         words = shlex.split(line, comments=True)
     except ValueError:
-        # An apostrophe of a comment, or a line cut short.
+        # An apostrophe in a comment, or a truncated line.
         words = line.split("#")[0].split()
     names: tuple[str, ...] = ()
     while words and words[0] in program.subcommands(*names):
@@ -74,7 +74,7 @@ def fault(program: Program, line: str) -> str | None:
             return f"no command {words[0]!r}"
         return None
     if program.subcommands(*names) and words and re.fullmatch(r"[a-z][a-z-]*", words[0]):
-        # A command that takes a word of its own, too, shows it in its usage.
+        # The usage shows whether a command also accepts an argument.
         if not re.search(r"^Usage: .*[\[<](?!OPTIONS|COMMAND)[A-Z]", program.help(*names), re.M):
             return f"no command {' '.join((*names, words[0]))!r}"
     for word in words:

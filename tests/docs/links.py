@@ -11,15 +11,15 @@ import sys
 import urllib.parse
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-# Text and target of a link or picture; not of one in a code span or code block.
+# Text and target of a link or image, outside of code spans and code blocks.
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)(?:\s+\"[^\"]*\")?\)")
 CODE = re.compile(r"^(```|~~~).*?^\1[^\n]*$|`[^`\n]*`", re.MULTILINE | re.DOTALL)
-# Templates have names to be filled in.
+# Templates contain placeholders.
 LEFT_OUT = "jetson/cli/templates/"
 
 
 def anchors(text: str) -> set[str]:
-    """Returns the anchors that GitHub makes of a document's headings."""
+    """Returns the anchors that GitHub creates for a document's headings."""
     found: dict[str, int] = {}
     names = set(re.findall(r"<a (?:id|name)=\"([^\"]+)\"", text))
     for heading in re.findall(r"^#{1,6} +(.*?) *#*$", re.sub(r"^(```|~~~).*?^\1", "", text, flags=re.M | re.S), re.M):

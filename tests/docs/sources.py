@@ -21,7 +21,7 @@ RULES = [
     (r"\b(?:so|how) (?:long|many|much|often|far|old)\b", 14, "give the measure: at most N, for N seconds"),
     (r"\b(?:tells?|told|says?|said|speaks?|knows?|knew|asks?|asked|believes?|forgets?)\b", 14,
      "software prints, reports, sends, estimates"),
-    (r"\b(?:whoever|whom|whose|nobody|somebody|who has|what of)\b", 4.6, "name the person, role or thing"),
+    (r"\b(?:whoever|nobody|somebody|what of)\b", 4.6, "name the person, role or thing"),
     (r"\b(?:as it has it|of its own|of theirs|of ours|its own)\b", 6, "own, separate"),
     (r"^\s*//[/!]\s+(?:It|Its|They|Them|The same|Whose|Which|When|Where|By whom)\b(?:\W+\w+){0,3}\.?$", 1,
      "begin with the noun"),

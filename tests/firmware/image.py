@@ -1,5 +1,5 @@
-"""Checks a chip's images as its loaders read them: parts where they look for them, headers, checksums
-and hashes by the vendor's esptool, room for settings and updates.
+"""Checks a chip's images as its loaders read them: addresses of the parts, headers, checksums and hashes with the
+vendor's esptool, free space for settings and updates.
 
     image.py esp32c3|esp8266 FOLDER
 """
@@ -14,9 +14,9 @@ from pathlib import Path
 
 FIRMWARE = Path(__file__).parent / "../../firmware-esp"
 FLASH = 4 << 20
-# Of the ESP32-C3.
+# ESP32-C3.
 BOOTLOADER, TABLE, PROGRAM = 0x0000, 0x8000, 0x10000
-# Of the ESP8266: what is not loaded but read where it lies, the core's settings, the SDK's own.
+# ESP8266: memory-mapped flash (read in place), settings of the core, data of the SDK.
 MAPPED, SETTINGS, PHY_DATA, BLANK = 0x10000, 0x3F0000, 0x3FC000, 0x3FE000
 
 
@@ -32,7 +32,7 @@ def table_of(image):
 
 
 def info(chip, image, what, sums):
-    """Lets esptool judge an image with so many sums; returns what it says."""
+    """Checks an image and its number of checksums with esptool; returns esptool's output."""
     with tempfile.NamedTemporaryFile(suffix=".bin") as file:
         file.write(image)
         file.flush()
@@ -45,7 +45,7 @@ def info(chip, image, what, sums):
 
 
 def esp32c3(folder):
-    """Loader, table of partitions, program."""
+    """Checks boot loader, partition table and program."""
     csv = FIRMWARE / "esp32c3/partitions.csv"
     image = (folder / "bridge-esp32c3.bin").read_bytes()
     update = (folder / "bridge-esp32c3-update.bin").read_bytes()
@@ -69,7 +69,7 @@ def esp32c3(folder):
 
 
 def esp8266(folder):
-    """The program in its two parts, the SDK's own data; and whether the emulator's map is the chip's."""
+    """Checks the two parts of the program, the SDK's data, and that the emulator's memory map matches the chip's."""
     image = (folder / "bridge-esp8266.bin").read_bytes()
     update = (folder / "bridge-esp8266-update.bin").read_bytes()
     loaded = (folder / "part-0x00000.bin").read_bytes()

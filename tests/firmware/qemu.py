@@ -1,11 +1,10 @@
-"""Runs the ESP8266's bridge in QEMU and passes MAVLink through it, both ways at once.
+"""Runs the ESP8266's bridge in QEMU and passes MAVLink through it in both directions.
 
-The emulator's radio is a socket of Ethernet frames, with the small network below at its other end:
-ARP, IPv4 and UDP of its own, so that nothing of the bridge's stack tests itself. Its serial line is
-a pty. Packets are pymavlink's: every message of the dialect in turn, random fields, MAVLink 1 and 2,
-some signed. What comes out must be, byte by byte, what went in: nothing lost, altered, or twice.
-Before that the network's other end does what a computer does that joins: asks for an address, and for
-the bridge by its name.
+The emulator's radio is a socket of Ethernet frames, with the small network below at its other end. It implements ARP,
+IPv4 and UDP independently of the bridge's stack. The serial line is a pty. Packets come from pymavlink: every message
+of the dialect in turn with random fields, MAVLink 1 and 2, some signed. The output must equal the input byte by byte:
+no packet lost, altered, or duplicated. Before that the network's other end behaves like a computer that joins: it
+requests an address, and resolves the bridge's name.
 
     qemu.py [--packets N] [--seed N] IMAGE
 """
@@ -32,13 +31,13 @@ FLASH_BYTES = 4 << 20
 OUR_MAC = bytes.fromhex("025646000002")
 BRIDGE_MAC = bytes.fromhex("025646826601")
 BRIDGE_PORT = 14550
-# A packet under way for so long is lost. The emulator is a few times slower than the chip and
-# shares the machine with other tests.
+# Timeout after which a packet counts as lost. The emulator is a few times slower than the chip and shares the machine
+# with other tests.
 PATIENCE_S = 20.0
-# Packets under way at once in each direction; UDP has no flow control of its own. So many fit into a
-# pty at once, whatever their size: a packet cut in two by our own pause is rightly given up.
+# Packets in flight in each direction; UDP has no flow control. This many fit into a pty at once at any size: the bridge
+# rightly drops a packet interrupted by a pause of this program.
 WINDOW = 12
-# A companion silent for longer than this is soon forgotten.
+# The bridge forgets a companion soon after this time without packets.
 SILENCE_S = 1.0
 
 
@@ -81,7 +80,7 @@ class Network:
         self._frame(0x0800, ip + udp)
 
     def receive(self):
-        """Takes one frame; returns (port it is for, payload), or None if it is no datagram."""
+        """Receives one frame; returns (destination port, payload), or None if it is not a datagram."""
         frame = self.wire.recv(2048)
         if not frame:
             raise SystemExit("the emulator closed its radio")
@@ -117,7 +116,7 @@ class Network:
 
 
 def join(network):
-    """Does what a computer does that joins: asks for an address (RFC 2131), and for a name (RFC 6762)."""
+    """Joins the network as a computer does: requests an address (RFC 2131), and resolves a name (RFC 6762)."""
     everybody = "255.255.255.255"
     network.listens |= {socket.inet_aton(everybody), socket.inet_aton("224.0.0.251")}
 
@@ -139,7 +138,7 @@ def join(network):
 
 
 class Sender:
-    """Makes packets of one MAVLink system: no two alike."""
+    """Generates packets of one MAVLink system, all different."""
 
     def __init__(self, rng, system, component, target):
         self.rng = rng
@@ -182,13 +181,13 @@ class Sender:
         return bytes(message.pack(self.signed if chance < 0.3 else self.plain))
 
 
-# Answered by the bridge itself, or read by it as being for everybody, so not only passed on.
+# Answered by the bridge itself, or broadcast packets that it reads as well, so not only forwarded.
 EXCLUDED = set()
 BRIDGE_COMPONENT = 240
 
 
 def split(data):
-    """Cuts whole packets off the front of bytes; returns (packets, rest)."""
+    """Splits complete packets off the front of bytes; returns (packets, rest)."""
     packets = []
     while len(data) >= 3:
         if data[0] == 0xFD:
@@ -205,7 +204,7 @@ def split(data):
 
 
 def is_bridge(packet):
-    """Whether the bridge itself sent a packet."""
+    """Returns whether the bridge itself sent a packet."""
     return packet[6 if packet[0] == 0xFD else 4] == BRIDGE_COMPONENT
 
 
@@ -228,8 +227,8 @@ def main():
     flash.flush()
     for number, descriptor in ((100, radio.fileno()), (101, serial), (102, flash.fileno())):
         os.dup2(descriptor, number, inheritable=True)
-    # Its clock counts instructions, 62.5 million a second: a busy machine slows it and never makes it
-    # see a pause within a packet that nobody made.
+    # Its clock counts instructions, 62.5 million a second: a busy machine slows the clock, and cannot cause a false
+    # pause within a packet.
     emulator = subprocess.Popen(
         ["qemu-system-xtensa", "-M", "sim", "-cpu", "lx106", "-semihosting", "-display", "none",
          "-monitor", "none", "-serial", "none", "-icount", "shift=4", "-kernel", options.image],
@@ -252,11 +251,11 @@ def main():
 
 
 def exercise(options, network, line, emulator):
-    """Passes the packets; returns packets per second, both ways together."""
+    """Passes the packets; returns packets per second, both directions together."""
     rng = random.Random(options.seed)
     companion = Sender(rng, 255, 190, (1, 1))
     vehicle = Sender(rng, 1, 1, (255, 190))
-    # When each packet under way was sent, the oldest first.
+    # Send time of each packet in flight, oldest first.
     sent = {"down": {}, "up": {}}
     under_way = {"down": 0, "up": 0}
     left = {"down": options.packets, "up": options.packets}
@@ -284,7 +283,7 @@ def exercise(options, network, line, emulator):
     while any(left.values()) or any(under_way.values()):
         extra = time.monotonic() - spoke > SILENCE_S
         if extra or (left["down"] and under_way["down"] < WINDOW):
-            # One to three packets a datagram, as companions batch them.
+            # One to three packets per datagram, as companions batch them.
             batch = [companion.packet()
                      for _ in range(min(rng.randrange(1, 4), max(left["down"], 1)))]
             for packet in batch:
@@ -292,7 +291,7 @@ def exercise(options, network, line, emulator):
             left["down"] = max(left["down"] - len(batch), 0)
             spoke = time.monotonic()
             network.send(14555, b"".join(batch))
-        # The vehicle speaks once the bridge knows whom to send to.
+        # The vehicle sends after the bridge has a destination address.
         while greeted and left["up"] and under_way["up"] < WINDOW:
             packet = vehicle.packet()
             send("up", packet)
@@ -314,7 +313,7 @@ def exercise(options, network, line, emulator):
             greeted = True
         if to_line:
             try:
-                # The bridge reads 128 bytes at a time: hardly ever what ends with a packet.
+                # The bridge reads 128 bytes at a time, which rarely end at a packet boundary.
                 to_line = to_line[os.write(line, to_line):]
             except BlockingIOError:
                 pass

@@ -1,6 +1,6 @@
-"""Makes a folder that stands for the vendor's SDK where there is none, so that the ESP8266's image is
-linked on every change: headers of sdk/ as they are, a library of every function that they declare (each
-returns at once), and as much memory as the SDK takes of the chip.
+"""Creates a folder that replaces the vendor's SDK, so that the ESP8266's image can be linked for every change: the
+headers of sdk/, a library with every function they declare (each returns at once), and as much memory as the SDK uses
+on the chip.
 
     sdk.py FOLDER
 """
@@ -12,18 +12,18 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-# What sdk/link says that SDK 3.0.5 takes. The data RAM's figure has its place in the emulator's map.
+# Sizes that sdk/link reports for SDK 3.0.5. The data RAM's size is in the emulator's map.
 INSTRUCTION_RAM, FLASH = 25_838, 204_000
 MAP = HERE / "../../firmware-esp/esp8266/qemu/link.ld"
-# Libraries that the link names besides the one with everything.
+# Libraries that the link names in addition to the one with all functions.
 EMPTY = ["net80211", "pp", "phy", "wpa", "crypto", "lwip", "hal"]
-# Of the application, called by the SDK; and what the SDK and the ROM have besides functions of its headers.
+# Functions of the application called by the SDK; and functions of the SDK and the ROM that are not in its headers.
 CALLED = ["user_pre_init", "user_init", "memchr", "__ctype_ptr__"]
 OTHERS = ["load_non_32_wide_handler", "eagle_lwip_getif", "__udivsi3"]
 
 
 def functions():
-    """Returns the names of all functions that the headers declare."""
+    """Returns the names of all functions declared in the headers."""
     names = set(OTHERS)
     for header in sorted(HERE.glob("sdk/**/*.h")):
         for line in header.read_text().splitlines():
@@ -63,7 +63,7 @@ def main():
         archive = folder / "lib" / f"lib{name}.a"
         subprocess.run([cross + "ar", "rc", archive, *([folder / "sdk.o"] if name == "main" else [])],
                        check=True)
-    # Erased flash: lengths are those of the SDK's own.
+    # Erased flash, with the length of the SDK's file.
     (folder / "bin/esp_init_data_default_v08.bin").write_bytes(b"\xff" * 128)
     (folder / "bin/blank.bin").write_bytes(b"\xff" * 4096)
 

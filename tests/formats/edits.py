@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Compares edits of scenes by `vizflyt scene edit` with those of splat-transform, where both have the operation.
+"""Compares edits of scenes by `vizflyt scene edit` with those of splat-transform, for operations that both have.
 
     edits.py --tools DIR VIZFLYT
 
-DIR holds node_modules/ (tests/formats/run installs it). Scenes of known splats, of every degree of harmonics, are
-turned, scaled, moved and cropped by both; the results are matched splat by splat. splat-transform edits in its own
-axes, half a turn about z from the file's: x and y change sign. A line each; the last reports how many passed.
+DIR holds node_modules/ (tests/formats/run installs it). Both rotate, scale, move and crop scenes of known splats with
+every degree of harmonics; the results are matched splat by splat. splat-transform edits in its own axes, a half turn
+about z from the file's: x and y change sign. Prints one line for each edit; the last line has the number of passed
+comparisons.
 """
 import argparse
 import pathlib
@@ -16,11 +17,11 @@ import tempfile
 import numpy as np
 from parity import errors, known, read_ply, write_ply
 
-# A few roundings of f32; turned harmonics are sums of up to seven products.
+# A few roundings of f32; rotated harmonics are sums of up to seven products.
 LOSS = (2e-6, 2e-6, 1e-5, 1e-6, 1e-6, 2e-6)
 PARTS = ('position', 'log scale', 'rotation', 'opacity', 'colour', 'harmonics')
 
-# Name, our steps, their actions, how many of 600 splats may be left.
+# Name, our steps, their actions, maximum number of the 600 splats in the result.
 EDITS = [
     ('move', ['--move', '-1,-2,3'], ['-t', '1,2,3'], (600, 600)),
     ('turn about x', ['--rotate', '-90,0,0'], ['-r', '90,0,0'], (600, 600)),
@@ -69,7 +70,7 @@ def main():
                         over.append('another order')
                     failure = '; '.join(over)
                     figures = ', '.join(f'{part} {e:.2g}' for part, e in zip(PARTS, worst))
-                except Exception as error:   # a tool's own failure is a result as well
+                except Exception as error: # a tool's own failure is a result as well
                     failure = f'{type(error).__name__}: {error}'
                 passed, failed = passed + (not failure), failed + bool(failure)
                 print(f"{'FAIL' if failure else 'ok  '} {name:20} degree {degree}  {failure or figures}", flush=True)

@@ -1,11 +1,11 @@
 // node ksplat.mjs NODE_MODULES write IN.ply OUT.ksplat LEVEL DEGREE
 // node ksplat.mjs NODE_MODULES read IN.ksplat OUT.json
-// The viewer's own library, as its converter uses it.
+// Uses the viewer's own library, like its converter.
 import { readFileSync, writeFileSync } from 'node:fs';
 import { pathToFileURL } from 'node:url';
 
 const [modules, verb, input, output, level, degree] = process.argv.slice(2);
-// The library asks for a browser's window when it is loaded.
+// The library needs a browser's window when it is loaded.
 globalThis.window ??= globalThis;
 globalThis.navigator ??= { userAgent: '' };
 const at = (name) => pathToFileURL(`${modules}/${name}`).href;
@@ -16,7 +16,7 @@ const file = readFileSync(input);
 const bytes = file.buffer.slice(file.byteOffset, file.byteOffset + file.byteLength);
 if (verb === 'write') {
     const splats = PlyParser.parseToUncompressedSplatArray(bytes, Number(degree));
-    // Opacity below this byte is thrown away; nothing is.
+    // Opacity below this byte is removed; 0 keeps everything.
     const generator = SplatBufferGenerator.getStandardGenerator(0, Number(level));
     const buffer = generator.generateFromUncompressedSplatArray(splats).bufferData;
     writeFileSync(output, Buffer.from(buffer));

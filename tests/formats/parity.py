@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Compares scene formats as we and other people's tools write and read them.
+"""Compares the scene formats of this project with those of other tools, for reading and writing.
 
     parity.py --tools DIR [--keep DIR] CONVERT
 
-DIR holds venv/ and node_modules/ (tests/formats/run installs them); CONVERT is our example program.
-For every tool, format and degree of harmonics there are up to two comparisons: "we read theirs" (they
-write the known scene, we convert it to PLY) and "they read ours" (we write it, they convert it to PLY).
-Splats are matched by position and must agree within what the format's steps allow. A line each; the
-last reports how many passed. --keep copies the files the tools wrote and the known scenes, which is how
-the fixtures of render-server/splat/tests/data/formats were made.
+DIR holds venv/ and node_modules/ (tests/formats/run installs them); CONVERT is the example program of this project. For
+every tool, format and degree of harmonics there are up to two comparisons: "we read theirs" (they write the known
+scene, we convert it to PLY) and "they read ours" (we write it, they convert it to PLY). Splats are matched by position
+and must agree within the format's resolution. Prints one line for each comparison; the last line has the number of
+passed ones. --keep copies the files written by the tools and the known scenes; the fixtures of
+render-server/splat/tests/data/formats were made this way.
 """
 import argparse
 import json
@@ -27,7 +27,7 @@ COLOUR = 1 / 255 / C0   # one step of a colour byte, as a harmonic
 # --- scenes as dictionaries of arrays: mean, log_scale, wxyz, opacity (0..1), sh [n, k, 3]
 
 def known(degree, count, seed):
-    """Splats far enough apart to be distinguished, with values that no format clamps."""
+    """Returns splats far enough apart to be distinguished, with values that no format clamps."""
     rng = np.random.default_rng(seed)
     cells = rng.permutation(14 ** 3)[:count]
     mean = np.stack([cells // 196, cells // 14 % 14, cells % 14], 1) * 0.5 - 3.25
@@ -56,7 +56,7 @@ def write_ply(path, scene):
 
 
 def read_ply(path):
-    """A plain binary PLY of float columns, in any order."""
+    """Reads a plain binary PLY of float columns, in any order."""
     data = path.read_bytes()
     end = data.index(b'end_header\n') + 11
     lines = [line.split() for line in data[:end].decode().splitlines()]
@@ -78,25 +78,25 @@ def read_ply(path):
 
 
 def turned(scene):
-    """Half a turn about x: y and z change sign. SPZ's axes (right, up, back) seen from the PLY's
-    (right, down, forward), and the other way round. A harmonic of degree l, order m changes sign as
-    its polynomial in x, y, z does."""
+    """Returns the scene rotated by a half turn about x: y and z change sign. This converts between SPZ's axes (right,
+    up, back) and the PLY's (right, down, forward). A harmonic of degree l, order m changes sign as its polynomial in x,
+    y, z does."""
     odd = np.array([0, 1, 1, 0, 1, 0, 0, 1, 0, 1, 0, 1, 1, 0, 1, 0][:scene['sh'].shape[1]])
     return dict(scene, mean=scene['mean'] * [1, -1, -1], wxyz=scene['wxyz'] * [1, 1, -1, -1],
                 sh=scene['sh'] * (1 - 2 * odd)[None, :, None])
 
 
-# --- what a format may lose: of positions [m], log scales, rotations [rad], opacity, colour, harmonics.
-# Whole steps, not halves: some writers cut where others round.
+# --- tolerances of a format: of positions [m], log scales, rotations [rad], opacity, colour, harmonics. Whole steps,
+# not halves: some writers truncate and others round.
 
 LOSS = {
     'compressed.ply': (6.9 / 1023, 2.5 / 1023, 0.01, 1 / 255, COLOUR, 1 / 32),
     'splat': (1e-6, 1e-5, 0.03, 1 / 255, COLOUR, 0),
-    # Version 2 keeps three bytes of the quaternion, from which w follows: near half a turn, poorly.
+    # Version 2 stores three bytes of the quaternion, and w follows from them: inaccurate near half a turn.
     'spz2': (1 / 4096, 1 / 16, 0.30, 1 / 255, 1 / 255 / 0.15, 1 / 8),
     'spz3': (1 / 4096, 1 / 16, 0.01, 1 / 255, 1 / 255 / 0.15, 1 / 8),
     'spz4': (1 / 4096, 1 / 16, 0.01, 1 / 255, 1 / 255 / 0.15, 1 / 8),
-    # 65535 steps of the logarithm, stretched most at the far end; codebooks of 256 values.
+    # 65535 steps of the logarithm, coarsest at the far end; codebooks of 256 values.
     'sog': (4.4 * 2 * 1.5 / 65535, 0.05, 0.04, 1 / 255, 0.06, 0.03),
     'ksplat0': (1e-6, 1e-5, 1e-3, 1 / 255, COLOUR, 1e-6),
     'ksplat1': (5 / 65535, 2e-3, 3e-3, 1 / 255, COLOUR, 1e-3),
@@ -109,7 +109,7 @@ PARTS = ('position', 'log scale', 'rotation', 'opacity', 'colour', 'harmonics')
 
 
 def errors(truth, found, degree):
-    """Returns the largest error of each part; splats are matched one to one, by position."""
+    """Returns the largest error of each part; splats are matched one to one by position."""
     if len(truth['mean']) != len(found['mean']):
         raise ValueError(f"{len(found['mean'])} splats instead of {len(truth['mean'])}")
     distance = np.linalg.norm(truth['mean'][:, None] - found['mean'][None], axis=2)
@@ -127,7 +127,7 @@ def errors(truth, found, degree):
             most(truth['sh'][:, 0] - f['sh'][:, 0]), most(truth['sh'][:, 1:kept] - f['sh'][:, 1:]))
 
 
-# --- tools: name -> (what it writes, what it reads), each a function of (from, to)
+# --- tools: name -> (formats written, formats read), each a function of (from, to)
 
 def run(*command):
     result = subprocess.run([str(part) for part in command], capture_output=True, text=True)
@@ -174,7 +174,7 @@ def tools(folder):
         rows = b.with_suffix('.json')
         run('node', pathlib.Path(__file__).with_name('ksplat.mjs'), modules, 'read', a, rows)
         v = np.array(json.loads(rows.read_text()))
-        # Colours and opacities are bytes; the library gives no harmonics one by one.
+        # Colours and opacities are bytes; the library has no access to single harmonics.
         write_ply(b, dict(mean=v[:, :3], log_scale=np.log(v[:, 3:6]), wxyz=v[:, 6:10],
                           opacity=(v[:, 13] / 255).clip(1e-6, 1 - 1e-6),
                           sh=((v[:, 10:13] / 255 - 0.5) / C0)[:, None]))
@@ -183,11 +183,11 @@ def tools(folder):
     npm = lambda name: json.loads((modules / name / 'package.json').read_text())['version']
     from importlib.metadata import version as pip
 
-    # Tool, format, degrees, their writer, their reader, and what to know about the tool:
-    # "axes": it copies the PLY's axes into SPZ, which says right, up, back; so it is given the scene
-    #   turned, and what it reads is turned back.
-    # "same": it writes this wrongly (its own reader and the others' disagree with it), so what we
-    #   read from it is compared with what splat-transform reads from the same file.
+    # Tool, format, degrees, their writer, their reader, and a peculiarity of the tool:
+    # "axes": it copies the PLY's axes into SPZ, whose axes are right, up, back; so its input is the
+    #   rotated scene, and its output is rotated back.
+    # "same": it writes this format wrongly (its own reader and the others' disagree), so our reading
+    #   of its file is compared with splat-transform's reading of the same file.
     reference = splat_transform()
     name = f"splat-transform {npm('@playcanvas/splat-transform')}"
     for kind in ('compressed.ply', 'sog'):
@@ -195,7 +195,7 @@ def tools(folder):
     yield name, 'spz2', range(4), None, reference, ''
     for version in (3, 4):
         yield name, f'spz{version}', range(4), splat_transform('--spz-version', version), reference, ''
-    # It writes glTF and does not read it.
+    # Writes glTF, but does not read it.
     yield name, 'glb', range(4), splat_transform(), None, ''
     yield name, 'splat', range(1), None, reference, ''
     for level in (0, 1, 2):
@@ -205,19 +205,19 @@ def tools(folder):
         yield name, kind, degrees, gaussforge('ply', kind), gaussforge(kind, 'ply'), ''
     both = gaussforge('ply', 'compressed.ply'), gaussforge('compressed.ply', 'ply')
     yield name, 'compressed.ply', range(1), *both, ''
-    # Its order of harmonics is not that of the others' writers and readers.
+    # Its order of harmonics differs from the other writers' and readers'.
     yield name, 'compressed.ply', range(1, 4), None, both[1], ''
     yield name, 'compressed.ply', range(1, 4), both[0], None, 'same'
     for version in (2, 3, 4):
         yield (name, f'spz{version}', range(4), gaussforge('ply', 'spz', version),
                gaussforge('spz', 'ply'), 'axes')
-    # It does not read the levels with buckets, not even from the viewer's own library.
+    # Does not read the levels with buckets, not even from the viewer's own library.
     yield name, 'ksplat0', range(2), gaussforge('ply', 'ksplat'), gaussforge('ksplat', 'ply'), ''
     yield name, 'ksplat0', range(2, 3), gaussforge('ply', 'ksplat'), None, 'same'
     name = f"gaussian-splats-3d {npm('@mkkellogg/gaussian-splats-3d')}"
     for level in (0, 1, 2):
         for degree in range(3):
-            # The library gives no harmonics one by one.
+            # The library has no access to single harmonics.
             yield (name, f'ksplat{level}', [degree], kellogg_write(level, degree),
                    None if degree else kellogg_read, '')
     name = f"gsply {pip('gsply')}"
@@ -228,7 +228,7 @@ def tools(folder):
     yield f"ply2splat {pip('ply2splat')}", 'splat', range(1), ply2splat, None, ''
     sogpy = lambda a, b: run(folder / 'venv/bin/sogpy', a, b)
     yield f"sogpy {pip('sogpy')}", 'sog', range(1), sogpy, None, ''
-    # Its palette is not the scene's harmonics, whoever reads it.
+    # Its palette differs from the scene's harmonics for every reader.
     yield f"sogpy {pip('sogpy')}", 'sog', range(1, 4), sogpy, None, 'same'
     name = f"spz-js {npm('spz-js')}"
     yield name, 'spz2', range(4), spz_js, spz_js, 'axes'
@@ -257,7 +257,7 @@ def main():
                         for part, e, limit in zip(PARTS, worst, loss) if not e <= limit]
                 figures = ', '.join(f'{part} {e:.2g}' for part, e in zip(PARTS, worst))
                 failure = '; '.join(over)
-            except Exception as error:   # a tool's own failure is a result as well
+            except Exception as error: # a tool's own failure is a result as well
                 figures, failure = '', f'{type(error).__name__}: {error}'
             passed, failed = passed + (not failure), failed + bool(failure)
             print(f"{'FAIL' if failure else 'ok  '} {label} {failure or figures}", flush=True)
@@ -269,8 +269,7 @@ def main():
             variant = ['--variant', kind[-1]] if kind[-1].isdigit() else []
             turn = turned if note == 'axes' else lambda scene: scene
             for degree in degrees:
-                # The palettes of harmonics keep every splat's own at these sizes; sogpy has no
-                # smaller one than 1024.
+                # The palettes keep every splat's harmonics at these sizes; sogpy's smallest palette is 1024.
                 count = 600 if kind != 'sog' else 1024 if 'sogpy' in tool else 256
                 truth = known(degree, args.count or count, 7 + degree)
                 source, given = scratch / f'known{degree}.ply', scratch / f'given{degree}.ply'

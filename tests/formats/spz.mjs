@@ -1,4 +1,4 @@
-// node spz.mjs NODE_MODULES IN.ply OUT.spz, or IN.spz OUT.ply: through spz-js.
+// node spz.mjs NODE_MODULES IN.ply OUT.spz, or IN.spz OUT.ply: converts with spz-js.
 import { createReadStream, readFileSync, writeFileSync } from 'node:fs';
 import { Readable } from 'node:stream';
 import { pathToFileURL } from 'node:url';

@@ -1,9 +1,10 @@
-"""Times gsplat on what `cargo bench --bench gpu -- --out FOLDER` left, and sets it beside our figures.
+"""Times gsplat on the output of `cargo bench --bench gpu -- --out FOLDER`, and prints it next to this project's
+figures.
 
 Usage: gsplat_times.py FOLDER
 
-RGB+ED: colour and expected depth, with harmonics of degree 3; all cameras in one call. A call ends
-with colour, depth and alpha copied to pinned host memory, as ours ends with images on the host.
+RGB+ED: colour and expected depth, with harmonics of degree 3; all cameras in one call. A call ends with colour, depth
+and alpha copied to pinned host memory, as this project's renderer ends with images on the host.
 """
 
 import json
@@ -15,7 +16,7 @@ import numpy as np
 
 
 def load_ply(path):
-    """Returns the columns of a binary PLY of floats, as our writer makes it, by name."""
+    """Returns the columns of a binary PLY of floats, as written by this project, by name."""
     with path.open("rb") as file:
         names, count = [], 0
         while (line := file.readline().decode().strip()) != "end_header":

@@ -1,10 +1,10 @@
-"""Flies with the given program and reads its logs with other people's packages.
+"""Flies with the given program and reads its logs with other projects' packages.
 
-What is checked: the file is whole for a strict reader, also after SIGKILL, unless that came within
-the one write a second: then a reader that streams gets all before it; every channel has a schema; Foxglove's messages
-decode, by the schemas in the file; colour is a JPEG that Pillow opens, of the calibration's size; poses are unit
-quaternions; replaying a full log twice gives the same bytes and the flight's own answers; a reduced one stays within
-60 MB a minute and has every observation's head.
+Checks: a strict reader accepts the file, also after SIGKILL, unless the signal came during the write that happens once
+a second: then a streaming reader gets all messages before it; every channel has a schema; Foxglove's messages decode
+with the schemas in the file; colour is a JPEG that Pillow opens, of the calibration's size; poses are unit quaternions;
+replaying a full log twice gives the same bytes and the flight's own answers; a reduced log stays within 60 MB a minute
+and has every observation's head.
 """
 
 import filecmp
@@ -46,7 +46,7 @@ def check(condition, what):
 
 
 def fly(program, folder, seconds, images, kill):
-    """Flies a demo; kills its runtime in flight if asked. Returns the log."""
+    """Flies a demo; kills its runtime in flight if requested. Returns the log."""
     command = [program, "demo", "--headless", "--seed", "7", "--seconds", str(seconds),
                f"--log={images}", f"--log-dir={folder}"]
     demo = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -56,8 +56,8 @@ def fly(program, folder, seconds, images, kill):
         if kill and "plugin flies" in line:
             logs = list(folder.glob("*.mcap"))
             check(len(logs) == 1, f"one log: {logs}")
-            # Some chunks, then the end without a word. At once after a chunk has begun to appear,
-            # so that the kill may well come within its write: the worst moment there is.
+            # Wait for some chunks, then kill at once after a chunk has begun to appear, so that the signal often
+            # arrives during its write: the worst case.
             want = logs[0].stat().st_size + 2_000_000
             while logs[0].stat().st_size < want and demo.poll() is None:
                 time.sleep(0.001)
@@ -85,7 +85,7 @@ def runtime(parent):
 
 
 def messages(file, is_cut):
-    """Returns all messages; of a file that was cut, those before."""
+    """Returns all messages; for a truncated file, those before the end."""
     if not is_cut:
         yield from make_reader(file, validate_crcs=True).iter_messages(log_time_order=False)
         return
@@ -97,8 +97,7 @@ def messages(file, is_cut):
 
 
 def read(path, is_whole, is_full):
-    """Reads a log; returns the number of messages by topic, its seconds, and whether its end is
-    missing."""
+    """Reads a log; returns the number of messages by topic, its duration [s], and whether its end is missing."""
     found, times, with_images = {}, [], 0
     is_cut = not path.read_bytes().endswith(b"\x89MCAP0\r\n")
     check(not (is_cut and is_whole), f"a log that was closed has an end: {path}")
@@ -152,8 +151,8 @@ def read(path, is_whole, is_full):
                 with_images += bool(decoded.images)
             elif is_first and topic == "/event":
                 check(decoded.message != "", "an event has a sentence")
-    # A file that is cut may end before what comes once a second, or with the first setpoint. A
-    # plugin may print nothing.
+    # A truncated file may end before messages that are written once a second, or before the first setpoint. A plugin
+    # may print nothing.
     rare = {"/plugin/output"}
     if is_cut:
         rare |= {"/setpoint/sent", "/timing", "/log", "/event"}
@@ -163,7 +162,7 @@ def read(path, is_whole, is_full):
     check(found["/camera/front/image"] == with_images, f"an image each: {found}")
     seconds = (max(times) - min(times)) / 1e9
     if not is_full:
-        # A log begins with a second's savings, and its last image may be beyond.
+        # A log starts with one second of budget, and its last image may exceed the budget.
         most = 1e6 * (seconds + 1) + 300_000
         check(path.stat().st_size <= most, f"{path.stat().st_size} bytes in {seconds} s")
     return found, seconds, is_cut
@@ -178,10 +177,10 @@ def replay(program, log, name):
 
 
 def follow_guide(log):
-    """Runs the Python of the guide on a log."""
+    """Runs the guide's Python code on a log."""
     guide = (pathlib.Path(__file__).parents[2] / "docs/guides/logs.md").read_text()
     scripts = re.findall(r"^```python\n(.*?)^```$", guide, re.M | re.S)
-    # The other one needs our own package: tests/python runs it.
+    # The other script needs this project's own package: tests/python runs it.
     [script] = [script for script in scripts if "from mcap" in script]
     done = subprocess.run([sys.executable, "-c", script.replace("flight.mcap", str(log))],
                           capture_output=True, text=True)

@@ -1,4 +1,5 @@
-"""Computes the absolute trajectory errors of a folder's fused trajectories with evo, and holds ours against them."""
+"""Computes the absolute trajectory errors of a folder's fused trajectories with evo, and compares them with this
+project's."""
 
 import csv
 import pathlib
@@ -9,7 +10,7 @@ from evo.tools import file_interface
 
 
 def ate_m(folder: pathlib.Path, name: str) -> float:
-    """Absolute trajectory error, unaligned, root of the mean square. [m]"""
+    """Returns the absolute trajectory error, unaligned, root mean square. [m]"""
     files = (folder / f"{name}-{kind}.tum" for kind in ("truth", "fused"))
     truth, fused = map(file_interface.read_tum_trajectory_file, files)
     assert truth.num_poses == fused.num_poses > 300, f"{name}: {fused.num_poses} poses"

@@ -1,4 +1,4 @@
-"""Holds `vizflyt evaluate` against evo: random trajectories and those of flights, by every alignment."""
+"""Compares `vizflyt evaluate` with evo: random trajectories and those of flights, with every alignment."""
 
 import json
 import pathlib
@@ -40,7 +40,7 @@ def wanted(
 
 
 def random_flight(random: np.random.Generator, folder: pathlib.Path) -> tuple[pathlib.Path, pathlib.Path]:
-    """A smooth truth, and an estimate in a frame of its own, with drift, noise and stamps of its own, as TUM's text."""
+    """Writes a smooth truth and an estimate as TUM files; the estimate has its own frame, drift, noise and stamps."""
     count = 600
     stamps = 1.7e9 + np.arange(count) * 0.01
     steps = np.cumsum(random.normal(0, 1, (count, 3)), axis=0) * 0.002
@@ -85,7 +85,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         for _ in range(20):
             compared += compare(vizflyt, *random_flight(random, pathlib.Path(name)), metres=0.2)
-    # Those along a line say nothing of rotation, and are refused by both.
+    # Both refuse trajectories along a line, which do not determine the rotation.
     for truth in sorted(flights.glob("Eight-*-truth.tum"))[:8]:
         compared += compare(vizflyt, truth, truth.with_name(truth.name.replace("truth", "fused")), metres=1.0)
     assert compared >= 1500, compared

@@ -1,9 +1,9 @@
-"""Reads what `vizflyt export` writes by what nobody here wrote: evo, Pillow, PyYAML, pandas with pyarrow, pypcd4.
+"""Reads the output of `vizflyt export` with other projects' packages: evo, Pillow, PyYAML, pandas with pyarrow, pypcd4.
 
     export.py VIZFLYT
 
-A graded flight, in lock-step, is logged with all images: where each image was rendered from is known exactly. Its
-project is p2 with a LiDAR and a range finder, and a camera that sees as a Raspberry Pi's does.
+A graded flight in lock-step is logged with all images, so that the pose of each rendered image is known exactly. Its
+project is p2 with a LiDAR, a range finder, and a camera with the noise of a Raspberry Pi's.
 """
 
 import json
@@ -58,12 +58,13 @@ def check_tum(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> None:
     truth = file_interface.read_tum_trajectory_file(folder / "groundtruth.txt")
     shown = file_interface.read_tum_trajectory_file(folder / "groundtruth_images.txt")
     assert truth.check()[0] and shown.check()[0]
-    # Images stand at the instants that they show: there the camera's own way passes where they were rendered from.
+    # Images have the stamps of the instants they show: at these times the camera's trajectory passes through the poses
+    # they were rendered from.
     truth_at, shown_at = sync.associate_trajectories(truth, shown, sync_method=sync.SyncMethod.interpolation)
     moving = np.linalg.norm(np.gradient(shown_at.positions_xyz, shown_at.timestamps, axis=0), axis=1) > 0.5
     off = np.linalg.norm(truth_at.positions_xyz - shown_at.positions_xyz, axis=1)[moving]
     assert moving.sum() > 50 and np.median(off) < 0.005, np.median(off)
-    # By 40 ms, the age of the poses behind them, they would be off by more.
+    # Stamps late by 40 ms, the age of their poses, would give larger errors.
     late = truth.timestamps - 0.040
     wrong = np.stack([np.interp(shown_at.timestamps, late, axis) for axis in truth.positions_xyz.T], axis=1)
     assert np.median(np.linalg.norm(wrong - shown_at.positions_xyz, axis=1)[moving]) > 3 * np.median(off)
@@ -75,7 +76,7 @@ def check_tum(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> None:
         color, metres = Image.open(folder / rgb), np.asarray(Image.open(folder / depth))
         assert color.mode == "RGB" and color.size == (row.width_px, row.height_px)
         assert metres.dtype == np.uint16 and metres.shape == color.size[::-1]
-        # 5000 a metre: whole millimetres are multiples of 5.
+        # 5000 per metre: whole millimetres are multiples of 5.
         assert (metres % 5 == 0).all() and 0.1 < np.median(metres[metres > 0]) / 5000 < 13.2
     assert np.abs(np.loadtxt(folder / "accelerometer.txt")[:, 3].mean() - 9.8) < 0.5
 
@@ -88,20 +89,20 @@ def check_euroc(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> None:
     assert truth.check()[0] and truth.num_poses > 500
     info = run(pathlib.Path(sys.executable).with_name("evo_traj"), "euroc", truth_csv)
     assert f"{truth.num_poses} poses" in info, info
-    # The same as what `evaluate` reads of the log itself.
+    # The result must equal that of `evaluate` on the log itself.
     same = json.loads(run(vizflyt, "evaluate", f"{log}#/pose", truth_csv, "--json"))
     assert same["pairs"] == truth.num_poses and same["ate_max_m"] < 1e-9, same
     sensor = yaml.safe_load((mav / "cam0/sensor.yaml").read_text())
     body_from_cam = np.array(sensor["T_BS"]["data"]).reshape(4, 4)
     assert np.allclose(body_from_cam[:3, :3] @ body_from_cam[:3, :3].T, np.eye(3), atol=1e-9)
-    # A camera's z is body x for one that looks ahead.
+    # A forward camera's z is body x.
     assert body_from_cam[0, 2] > 0.9, body_from_cam
     names = pd.read_csv(mav / "cam0/data.csv").iloc[:, 1]
     assert sorted(names) == sorted(path.name for path in (mav / "cam0/data").iterdir())
     assert Image.open(mav / "cam0/data" / names[0]).size == tuple(sensor["resolution"])
     imu = np.loadtxt(mav / "imu0/data.csv", delimiter=",")
     assert imu.shape[1] == 7 and (np.diff(imu[:, 0]) > 0).all()
-    # What a gyroscope says is how the truth turns.
+    # The gyroscope's rate must equal the rotation of the truth.
     yaw = np.unwrap(np.arctan2(*truth_yaw(truth)))
     turned = np.trapezoid(imu[:, 3], imu[:, 0] * 1e-9)
     assert abs(turned - (yaw[-1] - yaw[0])) < 0.1, (turned, yaw[-1] - yaw[0])
@@ -119,7 +120,7 @@ def matrices(table, name):
 
 
 def check_sensors(folder: pathlib.Path) -> None:
-    """Holds an exported LiDAR against the depth of a camera, and a range finder against the height that was flown."""
+    """Compares an exported LiDAR with the depth of a camera, and a range finder with the flown height."""
     mav = folder / "mav0"
     lidar = yaml.safe_load((mav / "top/sensor.yaml").read_text())
     assert lidar["sensor_type"] == "lidar" and 5 < lidar["rate_hz"] < 25, lidar
@@ -138,7 +139,7 @@ def check_sensors(folder: pathlib.Path) -> None:
         cloud = PointCloud.from_path(path)
         assert cloud.fields == ("x", "y", "z", "before_ns", "intensity", "ring") and cloud.points > 1000
         p_lidar, before = cloud.numpy(("x", "y", "z")).astype(float), cloud.numpy(("before_ns",))[:, 0].astype(np.int64)
-        # Each beam from where the vehicle was when it was fired, by the nearest pose.
+        # Each beam starts from the vehicle's pose when it was fired; takes the nearest pose.
         fired = np.clip(np.searchsorted(stamps, int(path.stem) - before), 0, len(stamps) - 1)
         from_lidar = poses[fired] @ body_from_lidar
         p_world = np.einsum("nij,nj->ni", from_lidar[:, :3, :3], p_lidar) + from_lidar[:, :3, 3]
@@ -164,13 +165,14 @@ def check_sensors(folder: pathlib.Path) -> None:
 
 
 def check_noise(folder: pathlib.Path) -> None:
-    """Of two cameras at one place, that with a sensor's noise differs from the perfect one from pixel to pixel."""
+    """Checks that of two cameras at one place, the one with sensor noise differs from the perfect one in single
+    pixels."""
     images = pd.read_csv(folder / "images.csv")
     pairs = images[images.camera == "down"].merge(images[images.camera == "truth"], on="timestamp_ns")
     assert len(pairs) > 50
     for pair in list(pairs.itertuples())[::20]:
         noisy, perfect = (np.asarray(Image.open(folder / file), float) for file in (pair.file_x, pair.file_y))
-        # Neighbours: exposure changes them alike.
+        # Differences of neighbouring pixels: exposure changes both alike.
         noise = np.std(np.diff(noisy - perfect, axis=1)) / np.sqrt(2)
         assert 1.0 < noise < 30.0, noise
 
@@ -186,7 +188,7 @@ def check_parquet(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> None
     assert {"images", "poses", "imu", "setpoints_asked", "setpoints_sent", "odometry"} == set(tables)
     csv = folder.with_name("beside")
     run(vizflyt, "export", log, "--format", "euroc", "-o", csv)
-    # Of images, what does not name files.
+    # For images, only the columns that are not file names.
     for name, first in (("images", 4), ("setpoints_sent", 0), ("setpoints_asked", 0)):
         of_csv = pd.read_csv(csv / f"{name}.csv")
         # CSV writes 1.0 as 1.
@@ -214,7 +216,7 @@ def check_refusals(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> Non
     text = folder / "text.mcap"
     text.write_text("hello")
     assert "not an MCAP file" in refused(vizflyt, "export", text, "--format", "tum", "-o", out)
-    # Cut before its first image, as that of a flight that was killed on the ground.
+    # Truncated before its first image, like the log of a flight killed on the ground.
     cut = folder / "cut.mcap"
     cut.write_bytes(log.read_bytes()[:3000])
     assert "no image" in refused(vizflyt, "export", cut, "--format", "euroc", "-o", out) or out.exists() is False

@@ -1,4 +1,4 @@
-"""What the tests share: a small vehicle, and a way to run a plugin against a rehearsal."""
+"""Shared fixtures: a small vehicle, and a way to run a plugin against a rehearsal."""
 
 import threading
 
@@ -29,7 +29,7 @@ def program(request):
 
 @pytest.fixture(autouse=True)
 def readable(tmp_path):
-    """A plugin that root starts runs as another user, who reads it."""
+    """Makes the folder readable: as root, a plugin runs as another user."""
     tmp_path.chmod(0o755)
 
 
@@ -38,7 +38,7 @@ def camera(name="front", width=64, height=48):
 
 
 def pattern(height, width, seed):
-    """Returns colour and depth that differ from pixel to pixel and from seed to seed."""
+    """Returns colour and depth that differ between pixels and between seeds."""
     random = np.random.default_rng(seed)
     rgb = random.integers(0, 256, (height, width, 3), dtype=np.uint8)
     depth_mm = random.integers(0, 60000, (height, width), dtype=np.uint16)
@@ -63,7 +63,7 @@ class Stage:
         return rgb, depth_mm
 
     def attach(self, plugin):
-        """Runs the plugin on a thread of its own; returns it once it is ready."""
+        """Runs the plugin on its own thread; returns the thread once the plugin is ready."""
         thread = Runner(plugin, self.rehearsal.service)
         thread.start()
         self.wait_attached()

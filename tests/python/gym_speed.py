@@ -1,4 +1,4 @@
-"""Prints the table of docs/BENCHMARKS.md: steps a second of `vizflyt.gym`, and the processor's time of one.
+"""Prints the table of docs/BENCHMARKS.md: steps per second of `vizflyt.gym`, and the processor time of one step.
 
     pip install vizflyt[gym]
     python tests/python/gym_speed.py
@@ -24,7 +24,7 @@ ROWS: list[tuple[str, int, dict[str, Any]]] = [
 
 
 def processor_s(envs: Any) -> float:
-    """Seconds of processor that the process which flies has taken."""
+    """Returns the processor time of the simulating process. [s]"""
     words = Path(f"/proc/{envs.unwrapped._flights._process.pid}/stat").read_text().rsplit(")")[-1].split()
     return (int(words[11]) + int(words[12])) / 100
 

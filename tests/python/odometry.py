@@ -1,10 +1,10 @@
-"""Writes the table of visual odometries' errors from grades.
+"""Prints the error table of the visual odometries from grades.
 
     vizflyt grade PLUGIN --project square --seeds 5 --variants day,dusk,fog -o square.json
     python3 tests/python/odometry.py square.json ...
 
-For each grade and variant a row in Markdown: the absolute trajectory error of the flights (root mean square), median
-and worst over the seeds, the largest error of all, and how many flights came through all gates.
+One Markdown row for each grade and variant: the absolute trajectory error of the flights (root mean square), median and
+maximum over the seeds, the largest error of all, and the number of flights that passed all gates.
 """
 
 import json
@@ -14,7 +14,7 @@ import sys
 
 
 def rows(grade: pathlib.Path) -> list[str]:
-    """Returns the rows of one grade, a variant each."""
+    """Returns the rows of one grade, one for each variant."""
     runs = json.loads(grade.read_text())["runs"]
     lines = []
     for variant in dict.fromkeys(run["variant"] for run in runs):

@@ -1,4 +1,4 @@
-"""What the tests of the course's projects have in common: students' folders, their own tests, graded flights."""
+"""Shared by the tests of the course's projects: students' folders, their own tests, graded flights."""
 
 import json
 import os
@@ -12,7 +12,7 @@ COURSE = Path(__file__).parents[2] / "docs/course"
 
 
 def handed_in(folder, project, who):
-    """Makes a student's folder: the project's starter, and for `solution` the reference over it."""
+    """Makes a student's folder: the project's starter; for `solution`, with the reference solution on top."""
     for source in ("starter", "solution")[: 1 + (who == "solution")]:
         shutil.copytree(
             COURSE / project / source, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__")
@@ -21,7 +21,7 @@ def handed_in(folder, project, who):
 
 
 def failing(folder):
-    """Runs the tests of a student's folder; returns the names of those that fail, and what pytest printed."""
+    """Runs the tests of a student's folder; returns the names of failed tests, and pytest's output."""
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-rf", "--tb=no", "-W", "error", "-p", "no:cacheprovider", str(folder)],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=300, cwd=folder.parent,
@@ -31,7 +31,7 @@ def failing(folder):
 
 
 def said_to_fail(project):
-    """Returns the tests of a project's starter that say that they fail so far."""
+    """Returns the tests of a project's starter that are documented to fail."""
     text = "\n".join(file.read_text() for file in sorted((COURSE / project / "starter").glob("test_*.py")))
     said = re.findall(r'^def (test_\w+)\([^\n]*\n    """([^"]+)', text, re.M)
     return {name for name, words in said if words.startswith("So far fails")}
@@ -51,5 +51,5 @@ def grade(program, folder, project, level, seeds=1, first=1):
 
 
 def points_of(project):
-    """Returns the sum of the points that an assignment's table gives."""
+    """Returns the sum of the points in an assignment's table."""
     return sum(map(int, re.findall(r"^\|[^|]+\| (\d+) \|", (COURSE / project / "README.md").read_text(), re.M)))

@@ -1,6 +1,6 @@
-"""Keeps the stub that editors read in step with the compiled module.
+"""Keeps the type stub for editors in step with the compiled module.
 
-    stub.py --check    fails if a name, or a docstring, is in one and not in the other
+    stub.py --check    fails if a name or a docstring differs between the two
     stub.py --write    copies the docstrings of the compiled module into the stub
 
 Signatures are written by hand in the stub; the documentation is written in the Rust source.
@@ -22,7 +22,7 @@ def main():
     faults, stale = compare(ast.parse(text))
     if write:
         lines = text.splitlines()
-        # From the end on, so that line numbers stay right.
+        # From the end to the start, so that line numbers stay valid.
         for node, doc in sorted(stale, key=lambda pair: -pair[0].lineno):
             put(lines, node, doc)
         STUB.write_text("\n".join(lines) + "\n")
@@ -33,7 +33,7 @@ def main():
 
 
 def compare(tree):
-    """Returns what must be put right by hand, and nodes with the docstrings they should have."""
+    """Returns the faults to correct by hand, and the nodes with outdated docstrings and their new text."""
     faults, stale = [], []
     stubs = {
         node.name: node for node in tree.body if isinstance(node, (ast.ClassDef, ast.FunctionDef))

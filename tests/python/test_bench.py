@@ -1,4 +1,5 @@
-"""tests/bench: the pure parts of the benchmark command, and that no measured table of docs/BENCHMARKS.md was typed."""
+"""tests/bench: the pure functions of the benchmark command, and that every measured table of docs/BENCHMARKS.md is
+generated."""
 
 import importlib
 import math
@@ -15,7 +16,7 @@ NAMES = ["machine", "document", "figures", "plot", "lab", "viewers", "growth", "
 
 
 def load():
-    """Returns the command's modules, which import one another by their plain names, and hides those names again."""
+    """Returns the command's modules, which import one another by their plain names, and removes those names again."""
     sys.path.insert(0, str(BENCH))
     try:
         return [importlib.import_module(name) for name in NAMES]
@@ -83,7 +84,7 @@ def test_damaged_markers_are_told_of(damaged, said):
 
 
 def test_text_between_tables_survives_any_damage():
-    """Whatever is done to the lines: an error, or only what stands between markers is another."""
+    """Damages lines at random: the result is an error, or only the text between markers changes."""
     chance = random.Random(1)
     lines = DOCUMENT.split("\n")
     for _ in range(2000):
@@ -148,16 +149,16 @@ def test_the_turn_that_was_disturbed_least_counts():
 
 
 @pytest.mark.parametrize("before, after, computing_ms, ratio", [
-    (figures.time(10.0), figures.time(12.0), 10.0, 1.2),      # slower
-    (figures.time(10.0), figures.time(12.0), 12.0, None),     # so is the machine
-    (figures.time(10.0), figures.time(10.0), 12.0, 10 / 12),  # faster than the machine says
+    (figures.time(10.0), figures.time(12.0), 10.0, 1.2), # slower
+    (figures.time(10.0), figures.time(12.0), 12.0, None), # the machine is slower by the same factor
+    (figures.time(10.0), figures.time(10.0), 12.0, 10 / 12), # faster than expected from the machine
     (figures.rate(60.0), figures.rate(50.0), 12.0, None),
     (figures.rate(60.0), figures.rate(50.0), 10.0, 50 / 60),
     (figures.count(20), figures.count(19), 99.0, None),
     (figures.count(20), figures.count(10), 99.0, 0.5),
     (figures.count(0), figures.count(0), 10.0, None),
     (figures.count(0), figures.count(1), 10.0, math.inf),
-    (figures.time(0.001), figures.time(0.002), 10.0, None),   # both are shown as 0.00
+    (figures.time(0.001), figures.time(0.002), 10.0, None), # both are shown as 0.00
 ])
 def test_what_moved_is_told_by_the_reference(before, after, computing_ms, ratio):
     found = figures.moved(taken({"a | b": before}), taken({"a | b": after}, computing_ms), "computing")

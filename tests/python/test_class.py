@@ -1,4 +1,4 @@
-"""A class is graded: hand-ins that anybody may have made, one table, a second run that flies only what is new."""
+"""Grading of a class: untrusted submissions, one table, a second run that flies only new submissions."""
 
 import csv
 import json
@@ -9,7 +9,7 @@ import zipfile
 
 import pytest
 
-# A plugin that tells what it can read of others, and ends.
+# A plugin that reports which files of others it can read, and ends.
 SPY = '''
 import pathlib, sys
 here = pathlib.Path(__file__).resolve().parent
@@ -27,7 +27,7 @@ raise SystemExit("sees " + ", ".join(sorted(found)))
 
 @pytest.fixture
 def desk(program, tmp_path):
-    """Runs the program on a desk whose Python has the package; returns its status and what it printed."""
+    """Runs the program in a folder whose Python has the package; returns its status and output."""
 
     def run(*arguments):
         done = subprocess.run(
@@ -62,7 +62,7 @@ def test_a_class_gets_its_grades_and_nobody_sees_the_others(desk, tmp_path):
     assert status == 0 and "2 of 4 teams have a grade" in said, said
     rows = {row["Team"]: row for row in csv.DictReader((tmp_path / "grades/grades.csv").read_text().splitlines())}
     assert rows["red"]["members"] == "Ann, Bo" and rows["red"]["score"] == "0.0" and rows["red"]["flights"] == "1", rows
-    # Points by the project's own table; nobody who has no grade has any.
+    # Points by the project's own table; an empty cell for students without a grade.
     assert float(rows["red"]["points"]) == 0 and float(rows["red"]["points_of"]) > 0, rows
     assert rows["up"]["points"] == "", rows
     assert "leads out" in rows["up"]["note"] and "nothing submitted" in rows["gone"]["note"], rows
@@ -74,10 +74,10 @@ def test_a_class_gets_its_grades_and_nobody_sees_the_others(desk, tmp_path):
         seeds.add(flight["seed"])
         seen = flight["reason"].split("sees ", 1)[1]
         if "signature" not in graded:
-            # No cell here, so nothing is hidden, nothing is signed, and the table says so.
+            # Without a sandbox nothing is hidden and nothing is signed, and the table says so.
             assert rows[team]["signed"] == "no", rows
             continue
-        # Its own folder, and where its folder lies; no other hand-in, grade or name.
+        # Its own folder and the parent folder only; no other submission, grade or name.
         assert f"plugins/{team}" in seen, seen
         for other in {"red", "blue", "up", "gone"} - {team}:
             assert f"/{other}" not in seen, seen
@@ -85,7 +85,7 @@ def test_a_class_gets_its_grades_and_nobody_sees_the_others(desk, tmp_path):
     assert len(seeds) == 2, "each team has courses of its own"
     assert (tmp_path / "grades/index.html").read_text().count("<tr>") == 5
 
-    # Again: what has a grade keeps it, and one that was changed is flown again; who hands in anew is graded anew.
+    # Second run: unchanged submissions keep their grades, changed ones are flown again, new ones are graded.
     changed = tmp_path / "grades/reports/blue/grade.json"
     if '"signature"' in (was := changed.read_text()):
         changed.write_text(was.replace('"score": 0.0', '"score": 99.0'))

@@ -1,4 +1,4 @@
-"""The course's first projects: their commands run as printed; solutions reach the bounds, starters do not."""
+"""The course's first projects: their printed commands run; solutions reach the bounds, starters do not."""
 
 import os
 import re
@@ -14,11 +14,11 @@ pytestmark = pytest.mark.course
 
 COURSE = Path(__file__).parents[2] / "docs/course"
 PROJECTS = ("p0", "p1")
-# An environment is there, and flights in real time are the lab's.
+# Not run: the environment exists already, and flights in real time belong to the lab.
 NOT_RUN = ("python3 -m venv", "pip ", "python -m pytest", "vizflyt demo")
-# Scores of such flights.
+# Scores of flights in real time.
 LIVE = re.compile(r"score_attitude\.py live")
-# What a starter fails in, and nothing else.
+# Exactly the tests that fail for a starter.
 UNFINISHED = {
     "p0": {"test_a_tilted_body_at_rest_is_seen_as_tilted", "test_a_bias_does_not_add_up_at_rest"},
     "p1": {
@@ -32,7 +32,7 @@ UNFINISHED = {
 
 
 def commands(project):
-    """Returns the commands of an assignment that are run here."""
+    """Returns the commands of an assignment that this test runs."""
     printed = re.findall(r"^\$ (.+)$", (COURSE / project / "README.md").read_text(), re.M)
     assert len(printed) > 8
     return [line for line in printed if not line.startswith(NOT_RUN) and not LIVE.search(line)]
@@ -58,7 +58,7 @@ class Student:
         return done.stdout
 
     def scores(self, lines):
-        """Runs commands; returns the points for tilt that each case got, and could get."""
+        """Runs commands; returns the tilt points of each case, and their maximum."""
         found = {}
         for line in lines:
             said = self.run(line)
@@ -70,14 +70,14 @@ class Student:
 
 @pytest.fixture(scope="module")
 def student(request, tmp_path_factory):
-    """A student who has followed both assignments without writing a line; `starters` are the points."""
+    """A student who has followed both assignments without changing any code; `starters` are the points."""
     program = request.config.getoption("--vizflyt")
     if program is None:
         pytest.skip("no --vizflyt given")
     folder = tmp_path_factory.mktemp("course")
     folder.chmod(0o755)
     student = Student(folder, Path(program).absolute())
-    # Project 1 records the same flight again: as its text says, it is left out.
+    # Project 1 records the same flight again; its text permits to omit it.
     second = [line for line in commands("p1") if line.startswith("vizflyt new") or not line.startswith("vizflyt")]
     student.starters = student.scores(commands("p0")) | student.scores(second)
     return student
@@ -85,7 +85,7 @@ def student(request, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def finished(student):
-    """The same student with the references in place; `solutions` are the points."""
+    """The same student with the reference solutions in place; `solutions` are the points."""
     for project in PROJECTS:
         student.run(f"cp {COURSE}/{project}/solution/*.py my-{project}/")
         again = [line for line in commands(project) if line.startswith("python ")]
@@ -138,7 +138,7 @@ def test_what_cannot_be_scored_is_said(finished, estimate, said):
 
 
 def test_the_whole_error_is_that_of_evaluate(finished):
-    """Another program over the same files: tilt and heading together, on the floor too."""
+    """Checks with `vizflyt evaluate` on the same files: tilt and heading together, on the floor too."""
     truth, estimate = "data/mav0/state_groundtruth_estimate0/data.csv", "my-p0/uncalibrated.tum"
     said = finished.run(f"vizflyt evaluate {truth} {estimate}")
     rmse_deg = float(re.search(r"attitude rmse (\S+) deg", said)[1])

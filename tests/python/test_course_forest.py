@@ -1,4 +1,4 @@
-"""The course's elective "forest": what a starter's tests find, and how fast the reference flies."""
+"""The course's elective "forest": results of a starter's tests, and the speed of the reference solution."""
 
 import re
 
@@ -7,7 +7,7 @@ from starters import COURSE, failing, grade, handed_in, points_of, said_to_fail
 
 pytestmark = pytest.mark.course
 
-# What the starter fails in, and nothing else.
+# Exactly the tests that fail for the starter.
 UNFINISHED = {
     "test_nothing_in_the_way_is_straight_on_and_fast",
     "test_a_trunk_in_the_way_is_passed_without_a_touch",
@@ -33,7 +33,7 @@ def test_a_starter_flies_into_a_trunk(program, tmp_path):
 
 
 def test_a_solution_is_fast_and_touches_nothing(program, tmp_path):
-    """By the project's file as it is here, whatever limits the program has been built with."""
+    """Uses the project's file from the source tree, even if the program was built with other limits."""
     project = COURSE.parents[1] / "render-server/scenes/projects/forest.toml"
     text = (COURSE / "forest/README.md").read_text()
     all_mps = float(re.search(r"^\| greatest speed [^|]*\| \d+ \| >= (\S+) m/s \|", text, re.M)[1])

@@ -1,4 +1,5 @@
-"""Project 2 of the course: its commands run as printed; the reference reaches the bounds, the starter does not."""
+"""Project 2 of the course: its printed commands run; the reference solution reaches the bounds, the starter does
+not."""
 
 import json
 import re
@@ -14,7 +15,7 @@ from test_course import COURSE, Student
 pytestmark = pytest.mark.course
 
 P2 = COURSE / "p2"
-# What the starter fails in, and nothing else.
+# Exactly the tests that fail for the starter.
 UNFINISHED = {
     "test_no_segment_through_something_is_free",
     "test_a_wall_is_passed_by_its_door",
@@ -34,13 +35,13 @@ UNFINISHED = {
 
 
 def printed(*beginnings):
-    """Returns the commands of the assignment that begin so."""
+    """Returns the assignment's commands with one of these beginnings."""
     lines = re.findall(r"^\$ (.+)$", (P2 / "README.md").read_text(), re.M)
     return [line for line in lines if line.startswith(beginnings)]
 
 
 def bounds(row):
-    """Returns what a row of the grading table asks for all the points: a number, or one for each level."""
+    """Returns the bound for full points in a row of the grading table: a number, or one for each level."""
     (cell,) = re.findall(rf"^\| {row}[^|]*\| \d+ \| ([^|]+) \|", (P2 / "README.md").read_text(), re.M)
     return [float(number) for number in re.findall(r"[<>]= ([\d.]+)", cell)]
 
@@ -52,7 +53,7 @@ def summary_and_flights(student, report):
 
 @pytest.fixture
 def student(request, tmp_path):
-    """Makes a student who has followed step 1, and has done nothing ("starter") or everything ("solution")."""
+    """Makes a student's folder after step 1, with the starter ("starter") or the reference solution ("solution")."""
     program = request.config.getoption("--vizflyt")
     if program is None:
         pytest.skip("no --vizflyt given")
@@ -90,7 +91,7 @@ def test_the_starter_flies_and_does_not_arrive(student):
 
 @pytest.mark.parametrize("student", ["solution"], indirect=True)
 def test_the_reference_reaches_every_bound(student):
-    """On two of the 20 maps at each level; then handed in, and graded with the class."""
+    """Flies two of the 20 maps at each level; then submits, and is graded with the class."""
     all_s, all_m = bounds("mean time"), bounds("least clearance")
     for level, least_s in zip(("ug", "g"), all_s):
         (line,) = printed(f"vizflyt grade my-p2 --project p2 --level {level} --seeds 20 ")

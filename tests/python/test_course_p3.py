@@ -1,4 +1,4 @@
-"""The course's project 3: what a starter's tests find, and what starter and solution get for a flight."""
+"""The course's project 3: results of a starter's tests, and grades of starter and solution."""
 
 import re
 import shutil
@@ -11,7 +11,7 @@ from starters import COURSE, failing, grade, handed_in, points_of, said_to_fail
 pytestmark = pytest.mark.course
 
 PROJECT = COURSE / "p3"
-# What the starter fails in, and nothing else.
+# Exactly the tests that fail for the starter.
 UNFINISHED = {
     "test_corners_of_a_frame_are_found",
     "test_a_corner_that_is_hidden_is_where_the_sides_meet",
@@ -46,7 +46,7 @@ def test_a_starter_flies_and_gets_nothing(program, tmp_path):
 
 @pytest.mark.parametrize("level", ["ug", "g"])
 def test_a_solution_passes_all_windows_within_all_bounds(program, tmp_path, level):
-    """With the network as it is in the folder, by day; one of the twenty courses that the figures are from."""
+    """Uses the network in the folder, by day; one of the twenty courses behind the published figures."""
     text = (PROJECT / "README.md").read_text()
     least_mps = float(re.search(r"^\| greatest speed [^|]*\| \d+ \| >= (\S+) m/s \|", text, re.M)[1])
     most_s = float(re.search(r"^\| mean time [^|]*\| \d+ \| <= (\S+) s \|", text, re.M)[1])
@@ -56,7 +56,7 @@ def test_a_solution_passes_all_windows_within_all_bounds(program, tmp_path, leve
 
 
 def test_the_starter_finds_by_the_same_network(tmp_path):
-    """The network that a student trains has the form that the starter's plugin reads: the reference's is one."""
+    """A trained network has the form that the starter's plugin reads; checked with the reference network."""
     folder = handed_in(tmp_path / "my-p3", "p3", "starter")
     shutil.copy(PROJECT / "solution/windows.onnx", folder)
     ask = "import numpy as np, plugin; print(plugin.Network()(np.zeros((240, 320, 3), np.uint8)).shape)"

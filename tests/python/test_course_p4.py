@@ -1,4 +1,4 @@
-"""The course's project 4: what a starter's tests find, and what starter and solution get for a flight."""
+"""The course's project 4: results of a starter's tests, and grades of starter and solution."""
 
 import re
 
@@ -8,7 +8,7 @@ from starters import COURSE, failing, grade, handed_in, points_of, said_to_fail
 pytestmark = pytest.mark.course
 
 PROJECT = COURSE / "p4"
-# What the starter fails in, and nothing else.
+# Exactly the tests that fail for the starter.
 UNFINISHED = {
     "test_a_gap_is_found_by_depth",
     "test_noise_and_pixels_without_return_hide_no_gap",

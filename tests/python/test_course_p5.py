@@ -1,4 +1,4 @@
-"""The course's project 5: what a starter's tests find, and what starter and solution get for a flight."""
+"""The course's project 5: results of a starter's tests, and grades of starter and solution."""
 
 import re
 import shutil
@@ -10,7 +10,7 @@ from starters import COURSE, failing, grade, handed_in, points_of, said_to_fail
 pytestmark = pytest.mark.course
 
 PROJECT = COURSE / "p5"
-# What the starter fails in, and nothing else.
+# Exactly the tests that fail for the starter.
 UNFINISHED = {
     "test_rays_meet_the_plane_where_the_hand_is",
     "test_the_angle_is_where_the_free_end_is",
@@ -34,7 +34,7 @@ UNFINISHED = {
 
 
 def folder_of(folder, who):
-    """Makes a student's folder; the reference takes the gap's part from project 4."""
+    """Makes a student's folder; the reference solution takes the code for the gap from project 4."""
     handed_in(folder, "p5", who)
     if who == "solution":
         shutil.copy(COURSE / "p4/solution/gap.py", folder)
@@ -68,7 +68,7 @@ def test_a_solution_finishes_in_the_time_for_half_of_the_points(program, tmp_pat
 
 
 def test_a_solutions_scores_are_those_of_the_answers():
-    """Quiz 1 and 4, by the reference's own functions."""
+    """Quiz 1 and 4, with the reference solution's functions."""
     sys.path.insert(0, str(PROJECT / "solution"))
     try:
         from score import by_luck, mean_score

@@ -1,4 +1,4 @@
-"""The Python in README and guide runs."""
+"""Runs the Python code in README and guides."""
 
 import re
 from pathlib import Path
@@ -20,7 +20,7 @@ BLOCKS = [
 def test_the_guide_names_what_intrinsics_have():
     guide = (ROOT / "docs/guides/plugin.md").read_text()
     table = guide[guide.index("## What it sees") : guide.index("## What it answers")]
-    # How one is made by hand stands with the example of a test.
+    # The example of a test shows how to construct these.
     names = [name for name in dir(vizflyt.Intrinsics) if not name.startswith(("_", "from_"))]
     assert "fx_px" in names and [name for name in names if f".{name}" not in table] == []
 

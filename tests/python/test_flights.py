@@ -1,4 +1,4 @@
-"""The example plugins fly in the simulated lab, by the real program."""
+"""Flies the example plugins in the simulated lab with the real program."""
 
 import json
 import signal
@@ -47,7 +47,7 @@ def test_avoid_crosses_the_forest(fly):
 def test_hover_turns_and_lands(fly):
     flight = fly(PLUGINS / "hover.py")
     assert "the plugin asked to land" in flight.report["reason"], flight.output
-    # 8 s of turning, and the way up and down.
+    # 8 s of yawing, take-off and landing.
     assert 8 < flight.report["seconds"] < 40, flight.output
 
 
@@ -97,7 +97,7 @@ def test_numbers_that_are_not_finite_end_in_a_landing_and_not_in_a_failure(fly, 
     )
     plugin.chmod(0o755)
     flight = fly(plugin)
-    # Ignored, then held, then landed, as docs/guides/safety.md says.
+    # Ignored, then held, then landed, as described in docs/guides/safety.md.
     assert "setpoints are refused: a number in it is not finite" in flight.report["reason"], flight.output
     assert "nan.py:9 in on_image: NotFiniteError: v_mps is [NaN, 0.0, 0.0]" in flight.output
     assert "holding: " in flight.output, flight.output
@@ -126,7 +126,7 @@ def test_a_plugin_attaches_stops_at_a_breakpoint_and_dies(program, tmp_path):
     try:
         wait_for("waiting for a plugin: start yours")
         (service,) = set(waiting_services()) - others
-        # By hand one names the service only if several wait.
+        # The service name is needed only if several wait.
         choose = [f"--vizflyt-service={service}"] if others else []
         plugin = subprocess.Popen([sys.executable, PLUGINS / "hover.py", *choose])
         wait_for("the plugin flies")

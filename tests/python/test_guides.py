@@ -1,4 +1,4 @@
-"""The scripts of docs/guides that send poses: their conversions, and the ROS 2 node on a fake rclpy."""
+"""The scripts of docs/guides that send poses: their conversions, and the ROS 2 node with a fake rclpy."""
 import importlib.util
 import json
 import math
@@ -43,7 +43,7 @@ def test_a_ros_pose_becomes_a_packet():
 
 
 def run_node(monkeypatch, parameters, topic, message):
-    """Runs the node's main on a fake ROS that has one message; returns the packet that it sends."""
+    """Runs the node's main on a fake ROS with one message; returns the packet that it sends."""
     subscribed = {}
 
     class Node:
@@ -102,7 +102,7 @@ def test_the_node_sends_the_transform_that_it_is_asked_for(monkeypatch):
 
 
 def packed(q):
-    """Packs x, y, z, w as the Crazyflie's firmware does, from its description."""
+    """Packs x, y, z, w as documented for the Crazyflie's firmware."""
     largest = max(range(4), key=lambda index: abs(q[index]))
     bits = largest
     for index in range(4):

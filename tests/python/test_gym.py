@@ -1,4 +1,4 @@
-"""Environments to learn in: Gymnasium's own check, the same flights again, one and many alike, rules, mistakes."""
+"""Gymnasium environments: Gymnasium's own check, reproducible flights, single and vectorised ones, rules, misuse."""
 
 import gc
 import warnings
@@ -15,7 +15,7 @@ IMAGES = dict(camera=(32, 24), observation=("state", "depth", "rgb"))
 
 @pytest.fixture
 def make(program):
-    """Makes environments that are closed at the end."""
+    """Makes environments that are closed at the end of the test."""
     made = []
 
     def make(name="Windows", number=None, **how):
@@ -39,7 +39,7 @@ def test_gymnasium_finds_nothing_wrong(make, how):
 
 
 def fly(envs, steps=60, seed=3):
-    """Returns all that a few flights have shown."""
+    """Returns all observations of a few flights."""
     random = np.random.default_rng(seed)
     seen = [envs.reset(seed=5)[0]]
     rewards = []
@@ -74,7 +74,7 @@ def test_many_fly_as_one_does(make):
 
 
 def towards(state, speed_mps=1.2, limit_mps=2.0):
-    """Returns the action that flies through what comes next: first onto the line that leads through it."""
+    """Returns the action that flies through the next window: first onto the line through its centre."""
     way_m, along = state[9:12], state[12:15]
     ahead_m = way_m @ along
     aim_m = way_m - along * np.clip(ahead_m - 0.3, -0.6, 0.8) if along.any() and ahead_m > 0 else way_m + 0.6 * along
@@ -137,7 +137,7 @@ def test_mistakes_are_explained(program, capfd):
     with pytest.raises(RuntimeError, match="ended with status 1"):
         vizflyt.gym.Env("p99", program=program)
     assert "no project 'p99'; there are" in capfd.readouterr().err
-    # Whose end would be told of by gymnasium, were it not marked as closed.
+    # Without the mark as closed, gymnasium would report the end.
     with pytest.raises(RuntimeError, match="ended with status 1"):
         vizflyt.gym.VectorEnv(2, "p99", program=program)
     gc.collect()

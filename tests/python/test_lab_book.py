@@ -1,4 +1,5 @@
-"""The lab book, hardware/lab: totals are the bill's sums, drawings have the sizes they say, links lead somewhere."""
+"""The lab book, hardware/lab: totals are the sums of the bill of materials, drawings have their stated sizes, links
+resolve."""
 
 import importlib.util
 import math
@@ -18,7 +19,7 @@ LAB = ROOT / "hardware" / "lab"
 def load(name):
     spec = importlib.util.spec_from_file_location(name, LAB / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module      # data classes look their module up by its name
+    sys.modules[name] = module # data classes look up their module by name
     spec.loader.exec_module(module)
     return module
 
@@ -30,7 +31,7 @@ costs = load("costs")
 # --- drawings: read back from the files ---
 
 def read_stl(path):
-    """Corners of the triangles, (n, 3, 3), and the normals that the file states, (n, 3)."""
+    """Returns the corners of the triangles, (n, 3, 3), and the normals in the file, (n, 3)."""
     data = path.read_bytes()
     (n,) = struct.unpack_from("<I", data, 80)
     assert len(data) == 84 + 50 * n
@@ -51,14 +52,15 @@ def edges(faces):
 
 
 def volume(faces):
-    """Positive where the corners of every triangle are counter-clockwise seen from outside."""
+    """Returns the volume: positive if the corners of every triangle are counter-clockwise seen from outside."""
     return float(np.einsum("ij,ij->", faces[:, 0], np.cross(faces[:, 1], faces[:, 2]))) / 6
 
 
 def holes(faces, z):
-    """Holes that go down from the flat surface at height z: (middle, distance of the nearest edge from there) of each.
+    """Returns the holes below the flat surface at height z: for each its centre and the distance to its nearest edge.
 
-    They are loops of edges that one triangle of the surface has; the loop around the outside is left out."""
+    They are loops of edges that belong to one triangle of the surface; the outer contour is excluded.
+    """
     flat = np.abs(faces[:, :, 2] - z).max(1) < 1e-4
     up = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])[:, 2] > 0
     once = edges(faces[flat & up])
@@ -74,7 +76,7 @@ def holes(faces, z):
 
 
 def to_edges(loop):
-    """Distance from a loop's middle to the nearest of its edges: what a round screw has room for."""
+    """Returns the distance from a loop's centre to its nearest edge: the maximum radius of a round screw."""
     a, b = loop - loop.mean(0), np.roll(loop, -1, 0) - loop.mean(0)
     along = b - a
     t = np.clip(-(a * along).sum(1) / (along ** 2).sum(1), 0, 1)
@@ -89,7 +91,7 @@ def of_diameter(found, diameter):
 def test_a_part_is_one_closed_body(parts, name):
     faces, normals = read_stl(parts / f"{name}.stl")
     seen = edges(faces)
-    # Each edge belongs to two triangles, which run along it in opposite directions.
+    # Each edge belongs to two triangles, which traverse it in opposite directions.
     assert set(seen.values()) == {1}
     assert all((b, a) in seen for a, b in seen)
     assert volume(faces) > 0
@@ -97,7 +99,7 @@ def test_a_part_is_one_closed_body(parts, name):
     area = np.linalg.norm(true, axis=1)
     assert area.min() > 1e-4
     assert np.abs(normals - true / area[:, None]).max() < 1e-3
-    # All of it hangs together.
+    # The body is connected.
     of = {}
     for i, face in enumerate(faces):
         for corner in map(tuple, face):
@@ -112,10 +114,10 @@ def test_a_part_is_one_closed_body(parts, name):
 
 
 @pytest.mark.parametrize("name, width, depth, height", [
-    # Arms at 45 degrees: the motors' middles, and an arm's round end on either side.
+    # Arms at 45 degrees: the motor centres, and an arm's round end on either side.
     ("frame-160", 160 / math.sqrt(2) + 20, 160 / math.sqrt(2) + 20, 2),
     ("frame-220", 220 / math.sqrt(2) + 26, 220 / math.sqrt(2) + 26, 4),
-    # The propeller, 4 mm of air and 1.6 mm of ring on either side.
+    # The propeller, 4 mm of clearance and 1.6 mm of ring on either side.
     ("guard-160", 76.2 + 11.2, 76.2 + 11.2, 21),
     ("guard-220", 127 + 11.2, 127 + 11.2, 30),
     ("bridge-tray", 30.5 + 8, 21 + 3.8, 5.6),
@@ -160,7 +162,7 @@ def test_a_guard_clears_its_propeller_and_its_neighbour(parts, name, propeller, 
     ring = faces[(faces[:, :, 2] > 3.01).all(1)].reshape(-1, 3)
     assert np.linalg.norm(ring[:, :2], axis=1).min() >= propeller / 2 + 3.9
     assert ring[:, 2].max() == pytest.approx(plane + 3)
-    # Two of them fit side by side on the frame: shafts are the diagonal over the root of two apart.
+    # Two of them fit side by side on the frame: the distance of shafts is the diagonal divided by sqrt(2).
     between = drawings.SIZES[name].diagonal / math.sqrt(2)
     assert 2 * np.linalg.norm(faces.reshape(-1, 3)[:, :2], axis=1).max() < between - 5
     found = holes(faces, 2)
@@ -186,14 +188,14 @@ def test_a_dxf_has_the_same_holes_as_the_stl(parts):
             if pair == ("0", "CIRCLE"):
                 circles.append([float(v) for _, v in pairs[i + 2:i + 5]])
         found = holes(read_stl(parts / f"frame-{name}.stl")[0], size.plate)
-        assert len(circles) == len(found) - 2  # the strap's slots are polylines
+        assert len(circles) == len(found) - 2 # the strap's slots are polylines
         for x, y, r in circles:
             assert any(np.abs(m - [x, y]).max() < 1e-3 and abs(d - r) < 0.01 for m, d in found)
         assert pairs.count(("0", "POLYLINE")) == 3
 
 
 def test_an_open_surface_is_noticed(parts):
-    """The checks above can fail: without one triangle the body is open; turned inside out its volume is negative."""
+    """Tests the checks above: without one triangle the body is open; turned inside out its volume is negative."""
     faces, _ = read_stl(parts / "leg-90.stl")
     seen = edges(faces[1:])
     assert not all((b, a) in seen for a, b in seen)
@@ -246,17 +248,18 @@ def test_a_changed_price_changes_the_pages():
 
 
 def test_the_papers_figures_come_out_of_its_own_numbers():
-    """26.26 and 110 USD: two vehicles of 475 USD a year, 62.5 USD a group and year, ten years, two offerings of 30."""
+    """Checks 26.26 and 110 USD: two vehicles of 475 USD a year, 62.5 USD per group and year, ten years, two offerings
+    of 30."""
     assert costs.paper(mocap=0) == pytest.approx(26.26, abs=0.02)
     assert costs.paper(mocap=50_000) == pytest.approx(110, abs=0.5)
-    # With the low end of its 5 to 50 thousand it would be 34.58: the 110 counts the high one.
+    # The low end of its 5 to 50 thousand would give 34.58: the 110 uses the high end.
     assert round(costs.paper(mocap=5_000)) != 110
 
 
-# --- what is reckoned in the pages ---
+# --- calculations in the pages ---
 
 def rows(page, start):
-    """Cells of the rows of the table of a page whose head begins so."""
+    """Returns the cells of the table in a page whose head begins with `start`."""
     lines = (LAB / page).read_text().split("\n")
     at = next(i for i, line in enumerate(lines) if line.startswith(start)) + 2
     found = []
@@ -314,7 +317,8 @@ def test_the_index_names_every_page_and_script():
 
 
 def test_ports_and_flow_control_are_named_alike():
-    """What `vehicle.toml` says of the two ports, the lab's pages and the guides say too; others are checked in Rust."""
+    """Checks that the lab's pages and the guides agree with `vehicle.toml` about the two ports; other places are
+    checked in Rust."""
     table = (ROOT / "hardware" / "vehicle.toml").read_text()
     ports = dict(re.findall(r'name = "(TELEM\d)"\ndevice = "(\w+)"', table))
     rtscts = dict(re.findall(r'name = "TELEM(\d)".*?rtscts = (\d)', table, re.S))

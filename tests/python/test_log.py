@@ -1,4 +1,4 @@
-"""`vizflyt.Log`: what a flight's log holds, as arrays."""
+"""`vizflyt.Log`: the contents of a flight's log as arrays."""
 
 import json
 import re
@@ -46,7 +46,7 @@ def pose_in_frame(at_ns, place, turn=(0, 0, 0, 1)):
 
 
 def write_log(path, messages, flight=None):
-    """Writes messages (topic, log time, bytes) as the runtime does: uncompressed chunks; no summary."""
+    """Writes messages (topic, log time, bytes) as the runtime does: uncompressed chunks, without a summary."""
     topics = list(dict.fromkeys(topic for topic, _, _ in messages))
     channels = b"".join(
         record(0x04, struct.pack("<HH", n, 0) + text(topic) + text("x") + struct.pack("<I", 0))
@@ -75,7 +75,7 @@ PROTOCOL = 13
 
 
 def header(place, width=64, height=48):
-    """ImageHeader of a camera at `place` that looks along body x, on the body's origin."""
+    """Returns the ImageHeader of a camera at `place` that looks along body x, at the body's origin."""
     forward = (-0.5, 0.5, -0.5, 0.5)
     numbers = (*place, *forward, 0, 0, 0, *forward, 50, 50, 32, 24, 0, 0, 0, 0, 0)
     return b"VZIM" + struct.pack("<HBB5Q23dIIdI", PROTOCOL, 0, 0, 9, 0, 0, 0, 0, *numbers, width, height, 0.001, 0)
@@ -142,7 +142,7 @@ def test_a_damaged_log_is_read_as_far_as_it_goes(tmp_path):
 
 @pytest.fixture(scope="module")
 def graded(request, tmp_path_factory):
-    """A graded flight of the built-in plugin: its log."""
+    """Returns the log of a graded flight of the built-in plugin."""
     program = request.config.getoption("--vizflyt")
     if program is None:
         pytest.skip("no --vizflyt given")
@@ -165,7 +165,7 @@ def test_a_graded_flight_is_read_in_five_lines(graded):
             off.append(np.linalg.norm(truth.translation_m - image.world_from_body.translation_m))
         at_image = log.pose_at_image.at(image.shown_ns)
         np.testing.assert_allclose(at_image.translation_m, image.world_from_body.translation_m)
-    # What a forecast over 30 ms is off by; by the pose's stamp it would be centimetres.
+    # Error of a forecast over 30 ms; with the pose's stamp it would be centimetres.
     assert np.median(off) < 0.01, off
     assert abs(np.median(log.imu.accel_mps2[:, 2]) - 9.8) < 0.5
     assert len(log.imu.at_ns) > 500 and (np.diff(log.imu.at_ns) > 0).all()
@@ -181,7 +181,7 @@ def test_the_guides_lines_run(graded, capsys):
 
 
 def test_the_lag_between_images_and_the_way_flown_is_none(graded):
-    """By how much images would have to be moved in time to fit the way flown best: 0, not the age of their pose."""
+    """The time shift of the images that fits the flown path best is 0, not the age of their pose."""
     log = vizflyt.Log(graded)
     shown, poses = log.pose_at_image, log.poses
     speed = np.linalg.norm(np.gradient(shown.p_m, axis=0), axis=1)
@@ -204,7 +204,7 @@ def test_a_published_estimate_is_logged_and_graded(request, tmp_path):
     tmp_path.chmod(0o755)
     plugin = tmp_path / "plugin"
     plugin.mkdir()
-    # Knows where it is, in a frame of its own, and drifts by 5 cm a second to the side.
+    # Estimates its position in its own frame, and drifts by 5 cm a second to the side.
     (plugin / "drifts.py").write_text(
         "import numpy as np\n"
         "import vizflyt\n"

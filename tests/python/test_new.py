@@ -1,4 +1,4 @@
-"""A new student's first minutes: a plugin made, tested, flown, saved in flight, broken, replayed."""
+"""A new student's first minutes: creates a plugin, tests it, flies it, saves it in flight, breaks it, replays it."""
 
 import json
 import subprocess
@@ -9,16 +9,16 @@ import pytest
 
 @pytest.fixture
 def first(program, tmp_path):
-    """Makes the plugin `first` on a desk of its own; its environment is this one."""
+    """Creates the plugin `first` in a new folder; it uses this process's environment."""
     done = subprocess.run([program, "new", "first", "--lang", "python"], cwd=tmp_path)
     assert done.returncode == 0
-    # As `pip install -r requirements.txt` would leave it.
+    # As after `pip install -r requirements.txt`.
     (tmp_path / "first/.venv").symlink_to(sys.prefix)
     return tmp_path / "first"
 
 
 class Flight:
-    """`vizflyt fly first` on the plugin's desk, read as it goes."""
+    """`vizflyt fly first` in the plugin's folder, with its output."""
 
     def __init__(self, program, first, *arguments):
         self.desk = first.parent
@@ -77,7 +77,7 @@ def test_a_file_saved_in_flight_flies_and_one_that_breaks_lands(program, first):
         change(first, "HEIGHT_M = 1.0", "HEIGHT_M = 1.3")
         flight.wait_for("holding: the plugin is being started again")
         flight.wait_for("the plugin flies again")
-        # What is not Python changes nothing: the old one flies on.
+        # A file with a syntax error changes nothing: the old version continues to fly.
         change(first, "def on_image", "deff on_image")
         flight.wait_for("not reloaded: first/plugin.py is not Python")
         change(first, "deff on_image", "def on_image")

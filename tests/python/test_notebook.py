@@ -1,4 +1,4 @@
-"""A lab flown by hand, what a notebook shows of it, and the notebook of the first hour, run as it is."""
+"""A lab flown by hand, its display in a notebook, and the notebook of the first hour, run unchanged."""
 
 import base64
 import gc
@@ -33,7 +33,7 @@ AHEAD = Setpoint.velocity([1, 0, 0])
 
 
 class End:
-    """The runtime of a flight, as a plugin's end of it: a hundred images a second."""
+    """The runtime's end of a plugin's connection: a hundred images a second."""
 
     def __init__(self, cameras=("front",)):
         self.info = vizflyt.ArenaInfo(name="stage", cameras=[camera(name) for name in cameras])
@@ -79,7 +79,7 @@ class End:
         self.failed_with.append(reason)
 
     def newest(self):
-        """Returns what the image that comes next is answered with."""
+        """Returns the answer to the next image."""
         count = len(self.answers)
         until(lambda: len(self.answers) > count + 1)
         return self.answers[-1][1]
@@ -94,7 +94,7 @@ def until(holds):
 
 @pytest.fixture
 def ground():
-    """A lab on the ground, and its runtime."""
+    """Returns a lab on the ground, and its runtime."""
     end = End()
     lab = Lab(cast(Any, end))
     until(lambda: lab._info is not None)
@@ -114,7 +114,7 @@ def test_one_waits_for_the_camera_that_is_asked_for():
     end = End(["front", "down"])
     lab = Lab(cast(Any, end))
     until(lambda: lab._info is not None)
-    # As of cameras of different rates: an observation has what was drawn at its instant.
+    # As with cameras of different rates: an observation has the images rendered at its instant.
     for _ in range(3):
         assert lab.look().camera("front") is not None
         assert [image.name for image in lab.look("down").cameras] == ["down"]
@@ -132,7 +132,7 @@ def test_on_the_ground_one_looks_and_nothing_is_answered(ground):
             call()
     with pytest.raises(RuntimeError, match=r"on the ground; close\(\) ends"):
         lab.land()
-    # The runtime takes off by either.
+    # Either of them makes the runtime take off.
     assert (end.answers, end.named) == ([], [])
     lab.close()
     assert end.failed_with == ["the notebook has detached from the lab before take-off"]
@@ -145,7 +145,7 @@ def test_nobody_gets_an_old_image(air):
     for _ in range(5):
         newest = end.seq
         obs = lab.look()
-        # Its pixels are of that number.
+        # Its pixels belong to that number.
         assert (obs.camera("front").rgb == pattern(48, 64, obs.seq)[0]).all()
         seen.append((newest, obs.seq))
         time.sleep(0.05)
@@ -173,7 +173,7 @@ def test_steps_join_up_and_the_last_one_ends_by_itself(air):
         seen.append(lab.step(setpoint).seq)
     assert seen == sorted(set(seen))
     answers = dict(end.answers[began:])
-    # The image that a step returns is answered with its setpoint.
+    # The image returned by a step is answered with its setpoint.
     assert [answers[seq] for seq in seen[:-1]] == asked[:-1]
     assert end.newest() == asked[-1]
     time.sleep(0.6)
@@ -209,12 +209,12 @@ def test_what_is_no_setpoint_to_fly_by_is_a_sentence(air):
 def test_a_setpoint_that_the_course_refuses_is_an_error_and_it_holds(air):
     lab, end = air
     end.refuses = [AHEAD, Setpoint.position([1, 0, 1])]
-    # One right after the other: the runtime speaks of the second only if a good one came between.
+    # One directly after the other: the runtime reports the second only if a valid one came between.
     for setpoint in end.refuses * 3:
         with pytest.raises(ValueError, match=f"setpoint refused: no {setpoint.kind}"):
             lab.fly(setpoint, 5)
     assert end.newest() == Setpoint.hold()
-    # A step has its image by then: the next one says it.
+    # The step already has its image by then: the next one reports it.
     lab.step(AHEAD)
     until(lambda: end.newest() == Setpoint.hold())
     with pytest.raises(ValueError, match="setpoint refused: no velocity"):
@@ -282,7 +282,7 @@ def test_without_an_image_it_says_so(air, monkeypatch):
 
 
 class Greeter(threading.Thread):
-    """Starts the stage's flight once somebody has attached."""
+    """Starts the stage's flight as soon as a plugin has attached."""
 
     def __init__(self, stage):
         super().__init__(daemon=True)
@@ -309,7 +309,7 @@ def test_through_shared_memory_it_attaches_once_sees_and_lets_go(stage):
     for seq in range(1, 8):
         threading.Timer(0.05, stage.publish, (seq,)).start()
         kept.append(lab.look())
-    # Kept ones stay as they were.
+    # Kept observations are unchanged.
     assert [obs.seq for obs in kept] == list(range(1, 8))
     assert all((obs.camera("front").rgb == pattern(48, 64, obs.seq)[0]).all() for obs in kept)
     stage.rehearsal.note("the net is open")
@@ -318,7 +318,7 @@ def test_through_shared_memory_it_attaches_once_sees_and_lets_go(stage):
     lab.close()
     assert stage.rehearsal.receive()[:3:2] == ("failed", "the notebook has detached from the lab before take-off")
     until(lambda: not stage.rehearsal.is_attached)
-    # And another one may be attached.
+    # Another runtime can be attached afterwards.
     other = Stage()
     attached(other).close()
 
@@ -344,7 +344,7 @@ def test_where_several_labs_wait_it_asks_which():
         vizflyt.attach()
     services = [one.rehearsal.service, two.rehearsal.service]
     assert all(service in str(caught.value) for service in services)
-    # Its traceback holds them both: no other test shall find them waiting.
+    # The traceback holds references to both: other tests must not find them waiting.
     del caught, one, two
     gc.collect()
     assert not set(services) & set(waiting_services())
@@ -364,7 +364,7 @@ def decoded(png):
 
 
 def scene():
-    """Returns an observation of two cameras: a ramp of depth from 1 to 5 m with a hole, and no depth at all."""
+    """Returns an observation of two cameras: a ramp of depth from 1 to 5 m with a hole, and no depth."""
     cameras = [camera(), camera("rear", width=32, height=20)]
     buffer = vizflyt.ObservationBuffer(cameras)
     depth_mm = np.linspace(1000, 5000, 64).astype(np.uint16)[None].repeat(48, axis=0)
@@ -382,7 +382,7 @@ def test_a_picture_is_a_png_of_colour_and_depth(tmp_path):
     assert (pixels == picture.pixels).all()
     assert (pixels[:, :64] == rgb).all()
     depth = pixels[:, 70:134].astype(int)
-    # The near is bright, the far dark, and what did not come back grey.
+    # Near is bright, far is dark, and missing depth is grey.
     assert (np.diff(depth[10].sum(axis=1)) <= 0).all() and depth[10, 0].sum() > 600 > 150 > depth[10, -1].sum()
     assert (depth[20, 30] == 90).all()
     # Its scale has the same ends.
@@ -398,7 +398,7 @@ def test_a_picture_of_an_observation_has_a_row_for_each_camera():
     obs, rgb = scene()
     pixels = vizflyt.show(obs).pixels
     assert pixels.shape[0] == 48 + 6 + 20 and (pixels[:48, :64] == rgb).all()
-    # Without depth there is colour alone.
+    # Without depth only colour is shown.
     assert (pixels[54:, :32] == obs.camera("rear").rgb).all() and (pixels[54:, 32:] == 255).all()
     image: Any = SimpleNamespace(rgb=rgb, depth=obs.camera("front").depth)
     assert (vizflyt.show(image).pixels == pixels[:48]).all()
@@ -415,7 +415,7 @@ def test_the_notebook_is_stored_without_outputs():
     words = [cell for cell in stored["cells"] if cell["cell_type"] == "markdown"]
     assert len(code) > 10 and len(words) > 10
     assert all(cell["outputs"] == [] and cell["execution_count"] is None and cell["metadata"] == {} for cell in code)
-    # And as it would be written again: a change of a line is a change of a line.
+    # The file is formatted as it would be written again, so that diffs are small.
     assert text == json.dumps(stored, indent=1, ensure_ascii=False) + "\n"
     for link in re.findall(r"\]\(([^)#]+)", "".join(line for cell in words for line in cell["source"])):
         assert (NOTEBOOK.parent / link).is_file(), link
@@ -442,7 +442,7 @@ class Run:
                 self.end_what_is_left()
 
     def end_what_is_left(self):
-        """Ends the lab that a cell that failed has left waiting."""
+        """Ends a lab that a failed cell has left waiting."""
         for process in Path("/proc").glob("[0-9]*"):
             try:
                 if (process / "cwd").resolve() == self.folder.resolve():
@@ -479,7 +479,7 @@ def test_the_first_hour_flies(run):
     z_m = run.number(r"at \[\S+ +\S+ +(\S+)\] m: x east")
     assert 0.9 < z_m < 1.5, run.text
     assert "the plugin asked to land\nthe lab has ended, status 0" in run.text
-    # Ahead, to the fence, and back.
+    # Ahead to the fence, and back.
     assert 4 < run.number(r"flown (\S+) m") < 15, run.text
 
 
@@ -505,7 +505,7 @@ def test_the_first_hour_is_stopped_before_the_fence(run):
 
 @pytest.mark.long
 def test_the_first_hour_ends_with_a_score(run):
-    # One of two, where the renderer rounds as here; on another processor a flight may end otherwise.
+    # One of two results, if the renderer rounds as here; on another processor a flight may end differently.
     score = run.number(r"(?m)^score +(\S+) \(95 %")
     flights = [float(score) for score in re.findall(r"^seed [23]: score (\d+), ", run.text, re.M)]
     assert len(flights) == 2 and set(flights) <= {0.0, 100.0} and score == sum(flights) / 2, run.text

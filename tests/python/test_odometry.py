@@ -1,4 +1,4 @@
-"""The visual odometries: their mathematics against closed forms, and flights by them."""
+"""The visual odometries: their mathematics against closed forms, and flights with them."""
 
 import json
 import math
@@ -18,7 +18,7 @@ import inertial_odometry as inertial  # noqa: E402
 import odometry_flight as flight  # noqa: E402
 import rgbd_odometry as rgbd  # noqa: E402
 
-# The paper's bound on all trajectories. [m]
+# The paper's bound for all trajectories. [m]
 BOUND_M = 0.12
 
 
@@ -46,7 +46,7 @@ def test_a_body_at_rest_is_levelled():
 
 
 def test_the_imu_carries_a_circle_on():
-    # 1.5 m/s on a circle of 2 m, nose along the way: a turn of 0.75 rad/s, and v omega towards the middle.
+    # 1.5 m/s on a circle of 2 m, nose along the path: a rate of 0.75 rad/s, and v omega towards the centre.
     v_mps, omega_radps, dt_s = 1.5, 0.75, 0.01
     zero = np.zeros(3)
     bias_g, bias_a = np.array([0.01, -0.02, 0.03]), np.array([0.1, 0.2, -0.1])
@@ -94,7 +94,7 @@ def test_errors_of_the_imu_go_on_as_motions_that_differ_do():
 
 
 def rays(count, views):
-    """Returns cameras that look along x from places along y, and true points before them."""
+    """Returns cameras that look along x from places along y, and true points ahead of them."""
     random = np.random.default_rng(5)
     axes = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     axes = np.broadcast_to(axes, (count, views, 3, 3)).copy()
@@ -147,7 +147,7 @@ DOWN = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
 
 
 def after_key_images(count):
-    """Returns an inertial odometry that moves ahead and to the left, with a camera that looks ahead."""
+    """Returns an inertial odometry that moves ahead and to the left, with a forward camera."""
     estimator = inertial.InertialOdometry()
     estimator.begin(flight.Standing(0.0, np.array([0.0, 0.0, 9.80665]), np.zeros(3)))
     for k in range(count):
@@ -177,7 +177,7 @@ def test_a_place_in_the_state_is_as_uncertain_as_it_is_off():
     at = slice(inertial.IMU_SIZE, inertial.IMU_SIZE + inertial.PLACE_SIZE)
     rest = np.r_[0 : at.start, at.stop : size + inertial.PLACE_SIZE]
     np.testing.assert_array_equal(estimator._covariance[np.ix_(rest, rest)], before)
-    # Drawn: the images were taken from elsewhere than where the state has them, and corners are off as well.
+    # Random errors: the true camera poses differ from those of the state, and corners have errors too.
     random = np.random.default_rng(11)
     drawn = random.multivariate_normal(np.zeros(size), before, 3000)
     seen = np.empty((len(drawn), len(clones), 2))
@@ -193,7 +193,7 @@ def test_a_place_in_the_state_is_as_uncertain_as_it_is_off():
     off_m = place_m - found_m
     sigma_m = np.sqrt(np.diag(estimator._covariance)[at])
     np.testing.assert_allclose(off_m.std(axis=0), sigma_m, rtol=0.08)
-    # It goes with where the body is, too: correlations.
+    # The error is correlated with that of the body's position.
     sigmas_m = sigma_m[:, None] * np.sqrt(np.diag(before)[inertial.P])
     together = (off_m[:, :, None] * drawn[:, None, inertial.P]).mean(axis=0)
     np.testing.assert_allclose(together / sigmas_m, estimator._covariance[at, inertial.P] / sigmas_m, atol=0.06)
@@ -210,7 +210,7 @@ def test_places_in_the_state_tell_where_the_body_is():
     estimator._place(sorted(estimator._sights))
     places_m = {place.name: place.p_m for place in estimator._places}
     assert len(places_m) == 20
-    # It drifts: farther than it believes to be.
+    # The true motion drifts further than the estimate assumes.
     truth, truth_m = estimator._motion.rotation, estimator._motion.p_m
     estimator._covariance[: inertial.IMU_SIZE, : inertial.IMU_SIZE] += np.diag(np.repeat([1e-4, 0, 4e-2, 0, 0], 3))
     turn = flight.exp_so3(np.array([0.01, -0.005, 0.008]))
@@ -220,10 +220,10 @@ def test_places_in_the_state_tell_where_the_body_is():
     looks["front", 3] = looks["front", 3] + 0.3
     estimator._use([], looks)
     assert {place.name for place in estimator._places} == set(places_m) - {("front", 3)}
-    # Turn and side-step look alike: a sigma of 1 to 3 cm is left.
+    # Rotation and sideways motion look alike: a sigma of 1 to 3 cm remains.
     np.testing.assert_allclose(estimator._motion.p_m, truth_m, atol=0.02)
     np.testing.assert_allclose(estimator._motion.rotation, truth, atol=0.004)
-    # What is no longer followed leaves the state.
+    # Places that are no longer tracked leave the state.
     estimator._forget_places({("front", 0), ("front", 5)})
     assert len(estimator._places) == 17
     assert len(estimator._covariance) == inertial.IMU_SIZE + 17 * inertial.PLACE_SIZE + 9 * inertial.CLONE_SIZE
@@ -231,7 +231,7 @@ def test_places_in_the_state_tell_where_the_body_is():
 
 @pytest.mark.parametrize("outliers", [0, 25])
 def test_the_pose_is_found_from_places(outliers, monkeypatch):
-    # Without a gyroscope, the guess is a wide one.
+    # Without a gyroscope, the guess has a large sigma.
     monkeypatch.setattr(rgbd, "SIGMA_TURN_RAD", 0.05)
     random = np.random.default_rng(7)
     rotation, p_m = flight.exp_so3(np.array([0.05, -0.1, 0.4])), np.array([1.0, -0.5, 1.2])
@@ -246,7 +246,7 @@ def test_the_pose_is_found_from_places(outliers, monkeypatch):
         seen.append((one, px, places_m, depth_m))
     guess, guess_m = rotation @ flight.exp_so3(np.array([0.02, -0.02, 0.03])), p_m + np.array([0.04, -0.05, 0.03])
     found, found_m, offs = rgbd.solve_pose(guess, guess_m, seen)
-    # Gauss-Newton's prior of 5 cm pulls a little towards the guess.
+    # Gauss-Newton's prior of 5 cm pulls slightly towards the guess.
     np.testing.assert_allclose(found_m, p_m, atol=1e-3 if outliers == 0 else 1e-2)
     np.testing.assert_allclose(found, rotation, atol=1e-3 if outliers == 0 else 1e-2)
     if outliers:
@@ -275,7 +275,7 @@ def test_contrast_is_spread_alike_everywhere():
     rgb = np.concatenate([rgb, rgb // 2 + 60, rgb, rgb])
     grey = flight.even_grey(rgb)
     assert grey.std() == pytest.approx(flight.SPREAD, abs=3)
-    # The same rows are as bright wherever they stand in the image.
+    # The same rows have equal brightness at any position in the image.
     np.testing.assert_array_equal(grey[130:170], grey[190:230])
 
 
@@ -320,7 +320,7 @@ def test_a_vehicle_that_lags_stays_near_the_path(name):
     follower = flight.Follower(points_m)
     p_m, v_mps, seconds = np.array([0.1, -0.1, 0.1]), np.zeros(3), 0.0
     while not follower.is_over:
-        # A first-order lag of 0.25 s, as the autopilot's velocity loop has.
+        # A first-order lag of 0.25 s, as in the autopilot's velocity loop.
         v_mps = v_mps + (follower.velocity(p_m, 1 / 30) - v_mps) / 30 / 0.25
         p_m, seconds = p_m + v_mps / 30, seconds + 1 / 30
         assert seconds < 40
@@ -364,7 +364,7 @@ def run(*command):
     [("rgbd_odometry.py", "square", "ug"), ("inertial_odometry.py", "spiral", "g")],
 )
 def test_flies_by_its_own_odometry_within_the_bound(program, tmp_path, plugin, project, level):
-    """In lock-step, and again over the images that the flight's log was exported to."""
+    """Flies in lock-step, and then repeats the estimate on the images exported from the flight's log."""
     grade, data = tmp_path / "grade.json", tmp_path / "data"
     report = tmp_path / "report"
     run(
@@ -379,5 +379,5 @@ def test_flies_by_its_own_odometry_within_the_bound(program, tmp_path, plugin, p
     estimate = tmp_path / "estimate.tum"
     run(sys.executable, PLUGINS / plugin, "--dataset", data, "-o", estimate)
     again = json.loads(run(program, "evaluate", log, estimate, "--align=yaw", "--json"))
-    # The same images and readings; only that they come one by one.
+    # The same images and readings, only one by one.
     assert again["ate_rmse_m"] < BOUND_M, again

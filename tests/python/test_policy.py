@@ -1,4 +1,4 @@
-"""A policy flown live: the guide's plugin computes the gym's state and a network's action, and flies a course."""
+"""Live flight of a policy: the guide's plugin computes the gym's state and a network's action, and flies a course."""
 
 import importlib.util
 import json
@@ -59,7 +59,7 @@ def test_a_velocity_changes_by_steps_and_stays_within_the_limit():
 
 
 def vehicle_of(state):
-    """Returns the vehicle that a state of the gym is of: its pose, and how it moves."""
+    """Returns pose and motion of the vehicle behind a state of the gym."""
     sine, cosine = state[18:20]
     world_from_heading = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     up_body = state[3:6] / np.linalg.norm(state[3:6])
@@ -76,7 +76,7 @@ def vehicle_of(state):
 
 
 def window_of(state):
-    """Returns the middle and the direction of the window that a state of the gym leads to. [m, world]"""
+    """Returns centre and direction of the next window in a state of the gym. [m, world]"""
     sine, cosine = state[18:20]
     world_from_heading = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     return state[15:18] + world_from_heading @ state[9:12], world_from_heading @ state[12:15]
@@ -86,7 +86,7 @@ def test_the_state_is_the_gym_s(program):
     env = vizflyt.gym.Env("p3", courses=[3], rate_hz=20, program=program)
     random = np.random.default_rng(2)
     state, _ = env.reset(seed=1)
-    # Where the first window is, does not change on the way to it.
+    # The position of the first window is constant on the way to it.
     windows = [window_of(state)] * 3
     most_tilted = 0.0
     for step in range(25):
@@ -101,7 +101,7 @@ def test_the_state_is_the_gym_s(program):
 
 @pytest.fixture
 def wing(tmp_path):
-    """The plugin with a policy made by hand: ahead, and sideways and up to the window's middle."""
+    """Returns the plugin with a hand-made policy: ahead, and sideways and up to the window's centre."""
     folder = tmp_path / "wing"
     folder.mkdir()
     for name in ("fly_windows.py", "windows.toml"):
@@ -135,7 +135,7 @@ def test_a_policy_flies_through_the_windows_that_the_map_tells(program, wing):
 
 
 def test_the_windows_found_are_those_that_the_gym_flies_to(program, wing):
-    """The plugin fails on purpose, and its last words are what it found."""
+    """The plugin fails on purpose, and reports the windows it found in its last message."""
     code = (wing / "fly_windows.py").read_text()
     found = 'self.windows = windows_of(json.loads(os.environ["VIZFLYT_MAP"]))'
     assert found in code

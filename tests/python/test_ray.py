@@ -1,6 +1,6 @@
-"""Ray's RLlib on two nodes: both fly, each its own episodes, reward rises, and nothing goes on when it has ended.
+"""Ray's RLlib on two nodes: both fly their own episodes, the reward rises, and no process remains at the end.
 
-Ray is large, and not among what tests/python/run installs. docs/guides/learning.md says how to run this.
+Ray is large, and tests/python/run does not install it. docs/guides/learning.md explains how to run this test.
 """
 
 import importlib.util
@@ -14,10 +14,10 @@ import pytest
 
 pytest.importorskip("ray.rllib", reason="Ray is not installed: pip install 'ray[rllib]' torch")
 pytest.importorskip("torch", reason="RLlib learns by PyTorch: pip install torch")
-# What Ray uses of itself and of others that is deprecated is not ours.
+# Deprecations within Ray and its dependencies do not matter here.
 pytestmark = pytest.mark.filterwarnings("ignore")
 
-import ray  # noqa: E402, after it is known to be there
+import ray # noqa: E402, after the check that it is installed
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "learn_ray.py"
 
@@ -34,7 +34,7 @@ def guide():
 
 
 def of_each(algorithm, what):
-    """Asks every process that flies; not the one that learns, which has vehicles to ask for their spaces alone."""
+    """Calls `what` in every flying process; not in the learner, whose vehicles only provide the spaces."""
     return algorithm.env_runner_group.foreach_env_runner(what, local_env_runner=False)
 
 
@@ -47,7 +47,7 @@ def draw(runner):
 
 
 def is_over(pid):
-    """Whether a process has ended; one that waits to be asked how has."""
+    """Returns whether a process has ended; a zombie counts as ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")")[-1].split()[0] == "Z"
     except FileNotFoundError:

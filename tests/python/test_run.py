@@ -1,4 +1,4 @@
-"""The main loop, as a process of its own: what the runtime receives when a plugin fails."""
+"""The main loop as a separate process: messages to the runtime when a plugin fails."""
 
 import signal
 import subprocess
@@ -26,7 +26,7 @@ class Process:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            # A shell's background jobs, these tests among them, ignore Ctrl-C and hand that on.
+            # A shell's background jobs, including these tests, ignore SIGINT, and their children inherit that.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         self.stage = stage
@@ -98,7 +98,7 @@ def test_what_is_printed_comes_at_once(stage, start):
     )
     process.ready()
     stage.answer(3)
-    # Through a pipe, while the plugin lives on.
+    # Through a pipe, while the plugin is still running.
     assert process.child.stdout.readline() == "seen 3\n"
 
 
@@ -159,7 +159,7 @@ def test_a_failure_is_one_sentence_with_the_students_own_line(stage, start, line
     if "exit" in reason:
         assert status == 0
     else:
-        # And the whole story where Python tells it.
+        # And the whole traceback on standard error.
         assert status == 1 and err.startswith("Traceback") and reason.split(": ")[1] in err
 
 
@@ -176,7 +176,7 @@ def test_a_number_that_is_not_finite_is_refused_and_the_plugin_goes_on(stage, st
     process.ready()
     for seq in range(1, 13):
         what, answered, setpoint, _ = stage.answer(seq)
-        # What the runtime refuses, whichever language sends it.
+        # Setpoints that the runtime refuses, in every language.
         assert (what, answered) == ("answer", seq) and "NaN" in repr(setpoint), setpoint
     assert stage.answer(13)[:3] == ("answer", 13, Setpoint.velocity([1, 0, 0]))
     stage.rehearsal.stop()
@@ -289,7 +289,7 @@ def test_started_by_hand_it_finds_the_runtime_that_waits(tmp_path):
         stage.rehearsal.stop()
         assert process.ended()[0] == 0
     else:
-        # Somebody else on this computer flies too: then it asks which.
+        # Another process on this computer flies too: then the plugin needs the service name.
         status, _, err = process.ended()
         assert status == 2 and "runtimes wait for a plugin: choose one" in err
     service = stage.rehearsal.service
@@ -319,7 +319,7 @@ def test_a_debugger_may_stop_it_for_seconds(stage, start):
 
 
 def test_time_from_an_image_to_on_image(stage, start, capsys):
-    """Prints the figure; a limit on time would fail on a busy computer."""
+    """Prints the latency; a limit would fail on a busy computer."""
     big = Stage(width=640, height=480)
     process = start(PLAIN.replace("return", "obs.camera('front').depth_mm[240, 320]; return"),
                     [f"--vizflyt-service={big.rehearsal.service}"])

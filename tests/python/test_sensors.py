@@ -1,4 +1,4 @@
-"""Sensors beside the cameras: their records are views of the memory, of the documented layout."""
+"""Sensors other than cameras: their records are views of the memory, with the documented layout."""
 
 import struct
 

@@ -1,4 +1,4 @@
-"""Setpoints, poses, volumes: what they take, and the one sentence for what they do not."""
+"""Setpoints, poses, volumes: accepted values, and the one-sentence error for others."""
 
 import math
 
@@ -10,7 +10,7 @@ from vizflyt import Pose, Setpoint, Volume
 
 
 class Tensor:
-    """Stands for torch's: numbers by the array protocol."""
+    """Replaces a torch tensor: numbers by the array protocol."""
 
     def __array__(self, dtype=None, copy=None):
         return np.array([1, 2, 3], dtype or np.float32)

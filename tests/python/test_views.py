@@ -1,4 +1,4 @@
-"""Images: where they lie, what they are, and what becomes of those that are kept."""
+"""Images: their memory, their contents, and their lifetime when a plugin keeps them."""
 
 import gc
 import warnings
@@ -12,7 +12,7 @@ import vizflyt
 
 
 def mapping_of(address):
-    """Returns the file behind an address of this process, as the kernel lists it."""
+    """Returns the file mapped at an address of this process, as listed by the kernel."""
     with open("/proc/self/maps") as maps:
         for line in maps:
             place, _, _, _, _, *file = line.split(maxsplit=5)
@@ -73,7 +73,7 @@ def test_every_imu_sample_comes_once():
     samples = [vizflyt.ImuSample([0, 0, n], [n, 0, 0], stamp_ns=n) for n in range(1, 8)]
     for newest in (3, 5, 7):
         stage.buffer.clear(newest)
-        # The newest four are always there: a reader that skips an observation misses none.
+        # The newest four are always included: a reader that skips an observation misses none.
         stage.buffer.set_imu(samples[max(newest - 4, 0) : newest])
         stage.rehearsal.publish(stage.buffer)
         assert stage.rehearsal.receive()[0] == "answer"
@@ -111,7 +111,7 @@ def test_no_pixel_is_copied_between_the_decoder_and_numpy():
             front = obs.camera("front")
             for array in (front.rgb, front.depth_mm, front.rgb[10:20, :, ::-1]):
                 seen.append(mapping_of(array.__array_interface__["data"][0]))
-            # The same memory at every look.
+            # The same memory for every access.
             assert np.shares_memory(front.rgb, obs.camera("front").rgb)
             assert not obs.is_copy
 
@@ -143,11 +143,11 @@ def test_kept_images_never_change_and_later_ones_are_copied_with_a_warning():
             assert (what, answered) == ("answer", seq)
         warned = [w for w in caught if w.category is vizflyt.HeldImagesWarning]
     assert len(warned) == 1 and "keep what you need with .copy()" in str(warned[0].message)
-    # Two stay where they are; all others are copies.
+    # The first two stay in place; all others are copies.
     assert [is_copy for _, is_copy, *_ in kept] == [False, False] + [True] * 38
     for seq, _, rgb, depth_mm in kept:
         assert (rgb == truth[seq][0][1:, ::2]).all() and (depth_mm == truth[seq][1]).all()
-    # Whoever lets go gets views again.
+    # A reader that releases its images gets views again.
     kept.clear()
     gc.collect()
     assert stage.answer(41)[0] == "answer"
@@ -191,18 +191,18 @@ def test_opencv_takes_the_arrays_as_they_are():
     corners = cv2.goodFeaturesToTrack(grey, 10, 0.01, 5)
     flat = corners.reshape(-1, 2)
     undistorted = cv2.undistortPoints(corners, front.intrinsics.opencv_matrix, None)
-    # OpenCV's pixels have their centres at whole numbers, ours at halves.
+    # OpenCV's pixels have their centres at whole numbers, this project's at halves.
     k = front.intrinsics
     slopes = (flat + 0.5 - [k.cx_px, k.cy_px]) / [k.fx_px, k.fy_px]
     assert np.allclose(undistorted.reshape(-1, 2), slopes, atol=1e-6)
-    # It cannot be drawn into, and says so; a copy can.
+    # Drawing into it raises an error; a copy is writable.
     with pytest.raises(cv2.error, match="readonly"):
         cv2.rectangle(front.rgb, (1, 1), (5, 5), (255, 0, 0))
     assert (cv2.rectangle(front.rgb.copy(), (1, 1), (5, 5), (255, 0, 0))[1, 1] == [255, 0, 0]).all()
 
 
 def test_other_libraries_read_the_arrays_in_place():
-    """torch, jax and cupy take arrays by these protocols."""
+    """Checks the protocols by which torch, jax and cupy take arrays."""
     obs, *_ = observation()
     front = obs.camera("front")
     address = front.depth.__array_interface__["data"][0]

@@ -1,4 +1,4 @@
-"""`vizflyt grade --watch`: graded again when the plugin is saved, with what changed; nothing half done is left."""
+"""`vizflyt grade --watch`: grades again when the plugin is saved, and reports changes; leaves no partial results."""
 
 import os
 import signal
@@ -37,7 +37,7 @@ def program(request):
 
 
 class Watched:
-    """`vizflyt grade --watch` in a folder of its own."""
+    """`vizflyt grade --watch` in its own folder."""
 
     def __init__(self, folder, program, *options):
         self.folder, self.plugin = folder, folder / "plugin.py"
@@ -72,7 +72,7 @@ def test_a_saved_plugin_is_graded_again_and_compared(tmp_path, program):
     try:
         watched.until("waiting until")
         first = (tmp_path / "report/grade.json").read_text()
-        # The same, saved again: a round of its own, with nothing new.
+        # Saved again without a change: a new round with the same results.
         watched.save(20)
         watched.until("waiting until", 2)
         assert "nothing changed: 1 flights went as before" in watched.out.read_text()
@@ -123,7 +123,7 @@ def test_an_attempt_is_compared_with_the_one_that_is_named(tmp_path, program):
     (tmp_path / "plugin.py").write_text(PLUGIN.format(images=40))
     status, said = grade(1, "--since", "first")
     assert status == 0 and "since the last attempt" in said and "finished 0 -> 0 of 1" in said, said
-    # Another project's flights are no earlier attempt, and neither is a folder without a grade.
+    # Grades of another project, and folders without a grade, are not earlier attempts.
     status, said = grade(1, "--since", "first", "--project", "p4")
     assert status == 1 and "the earlier attempt is of project p3" in said, said
     (tmp_path / "empty").mkdir()

@@ -1,4 +1,4 @@
-"""Where there is no Rust: the wheel is all, in an environment that has nothing else."""
+"""Without Rust: the wheel is sufficient in an empty environment."""
 
 import json
 import subprocess
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-# What a package index takes of one file without being asked is 100 MB; a student's line is slow.
+# A package index accepts files up to 100 MB by default; the limit here is lower because of slow connections.
 MOST_BYTES = 40 << 20
 
 
@@ -28,7 +28,7 @@ def test_pip_install_is_all_that_a_student_needs(wheel, tmp_path):
     subprocess.run([*pip, wheel], check=True)
 
     def run(*arguments):
-        """Runs the program that pip has installed, where nothing else is on PATH."""
+        """Runs the program installed by pip, with nothing else on PATH."""
         environment = {"PATH": str(bare / "bin"), "HOME": str(tmp_path)}
         return subprocess.run(
             ["vizflyt", *arguments],
@@ -42,10 +42,10 @@ def test_pip_install_is_all_that_a_student_needs(wheel, tmp_path):
         )
 
     made = run("new", "p4", "--project", "p4")
-    # Its Python has the package: there is nothing left to install.
+    # Its Python has the package: no further installation is needed.
     assert made.returncode == 0 and made.stdout.split() == "p4 created; next vizflyt fly p4".split(), made.stdout
     for file in (tmp_path / "p4").rglob("*"):
-        # The folder goes to another computer as it is.
+        # The folder can be copied to another computer.
         assert file.is_dir() or str(Path(__file__).parents[2]) not in file.read_text(), file
     flown = run("fly", "p4", "--headless", "--seconds", "6", "--report", "report.json")
     report = json.loads((tmp_path / "report.json").read_text())

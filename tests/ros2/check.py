@@ -1,8 +1,8 @@
-"""Subscribes to a flight by Cyclone DDS, an independent implementation, and flies it.
+"""Subscribes to a flight with Cyclone DDS, an independent implementation, and flies it.
 
-First the runtime's part is played (`vizflyt.Rehearsal`), so that every pixel is known; then the simulated lab is flown.
-Ends with a table: how long each topic takes from the image's publication on, and what it carries, beside the plugin's
-own way. Exit status 0 only if every check passed.
+First this program takes the runtime's part (`vizflyt.Rehearsal`), so that every pixel is known; then it flies the
+simulated lab. Ends with a table of each topic's latency from the image's publication, and its load, together with the
+plugin's own path. Exit status 0 only if every check passed.
 """
 import io
 import itertools
@@ -34,7 +34,7 @@ from vizflyt import Setpoint
 WIDTH, HEIGHT = 640, 480
 RATE_HZ, IMAGES = 12, 36
 FRONT = "vizflyt/front/"
-# From this process's monotonic clock to time since 1970, as the node's stamps have it. [ns]
+# Offset from this process's monotonic clock to time since 1970, as in the node's stamps. [ns]
 UNIX_NS = time.time_ns() - time.monotonic_ns()
 
 CDR1 = Policy.DataRepresentation(use_cdrv0_representation=True)
@@ -44,12 +44,12 @@ DEFAULT = Qos(RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(100)
 STATIC = Qos(RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(1), CDR1)
 
 checks = 0
-# Lines of the node and of the flight, for who looks for what went wrong.
+# Output of the node and of the flight, for diagnosis.
 printed: list[str] = []
 
 
 def check(holds, text):
-    """Counts a check, or ends the program with a sentence."""
+    """Counts a check, or ends the program with a message."""
     global checks
     if not holds:
         sys.exit("\n".join(["what was printed last:", *printed[-20:], f"tests/ros2: {text}"]))
@@ -67,33 +67,33 @@ def wait_for(what, text, seconds=20.0):
 
 
 class Inbox:
-    """A subscriber that keeps each message as it came, with the time."""
+    """A subscriber that keeps each message undecoded, with its time of receipt."""
 
     def __init__(self, domain, name, kind, qos):
         self.name, self.kind = name, kind
         topic = Topic(domain, f"rt/{name}", kind)
         self.reader = DataReader(domain, topic, qos=qos)
-        # A list of a million numbers takes longer to make than an image to send: decoded is what is looked at.
+        # Decoding a list of a million numbers takes longer than sending an image: decode only checked messages.
         topic.data_type = AsItCame
         self.found = []
 
     def poll(self):
-        """Takes what is there; returns how many."""
+        """Takes the waiting messages; returns their number."""
         taken = [sample for sample in self.reader.take(20) if isinstance(sample, Raw)]
         self.found += taken
         return len(taken)
 
     def is_matched(self):
-        """Whether somebody sends this."""
+        """Returns whether the topic has a publisher."""
         return len(self.reader.get_matched_publications()) > 0
 
     def messages(self):
-        """Returns all that came, decoded."""
+        """Returns all received messages, decoded."""
         return [sample.decode(self.kind) for sample in self.found]
 
 
 class AsItCame:
-    """Takes the place of a message's type, and decodes nothing."""
+    """Replaces a message's type, and decodes nothing."""
 
     @staticmethod
     def deserialize(data):
@@ -105,14 +105,14 @@ class AsItCame:
 
 
 class Raw:
-    """A message as it came."""
+    """An undecoded message."""
 
     def __init__(self, data):
         self.came_ns, self.data = time.time_ns(), bytes(data)
         self.sample_info = None
 
     def stamp_ns(self):
-        """Returns the stamp of its header, behind four bytes of encapsulation. [ns since 1970]"""
+        """Returns the stamp of its header, after four bytes of encapsulation. [ns since 1970]"""
         sec, nanosec = struct.unpack_from("<iI", self.data, 4)
         return sec * 1_000_000_000 + nanosec
 
@@ -121,7 +121,7 @@ class Raw:
         return kind.deserialize(self.data)
 
     def tail(self, count, dtype, behind=0):
-        """Returns `count` numbers at its end but for `behind` bytes: the pixels of an image."""
+        """Returns the last `count` numbers before the final `behind` bytes: the pixels of an image."""
         end = len(self.data) - behind
         return np.frombuffer(self.data[end - count * np.dtype(dtype).itemsize:end], dtype)
 
@@ -141,14 +141,14 @@ class Node:
             printed.append(line.rstrip())
 
     def said(self, words):
-        """Whether it has printed these words since this was last asked."""
+        """Returns whether the node has printed these words since the last call."""
         while not self.lines.empty():
             if words in self.lines.get():
                 return True
         return False
 
     def end(self):
-        """Asks it to end; returns its exit status."""
+        """Stops the node; returns its exit status."""
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(10)
 
@@ -182,7 +182,7 @@ class Stage:
         check(ready is not None and ready[0] == "ready", f"instead of ready: {ready}")
 
     def pose(self, seq):
-        """Returns where the body is at image `seq`: on a line, turning, pitched."""
+        """Returns the body's pose at image `seq`: on a line, yawing, pitched."""
         yaw, pitch = 0.02 * seq, 0.2
         (sy, cy), (sp, cp) = ((np.sin(angle / 2), np.cos(angle / 2)) for angle in (yaw, pitch))
         return vizflyt.Pose("world", "body", [0.1 * seq, 1.0, 1.5], [-sy * sp, cy * sp, sy * cp, cy * cp])
@@ -211,7 +211,7 @@ class Stage:
         return answer[2]
 
     def of(self, stamp_ns):
-        """Returns number, colour and time of publication of the image with this stamp, to within a clock's reading."""
+        """Returns number, colour and publication time of the image with this stamp, within the clock's resolution."""
         nearest = min(self.shown, key=lambda shown: abs(shown - stamp_ns))
         check(abs(nearest - stamp_ns) < 8_000_000, f"no image was of {stamp_ns}")
         return self.shown[nearest]
@@ -235,7 +235,7 @@ def subscribe(domain):
 
 
 def poll(inboxes, seconds):
-    """Takes what comes within this time."""
+    """Takes messages for this time."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         if not sum(inbox.poll() for inbox in inboxes.values()):
@@ -243,14 +243,14 @@ def poll(inboxes, seconds):
 
 
 def grow(stamps):
-    """Whether each is later than the one before."""
+    """Returns whether each stamp is later than the one before."""
     return all(later > stamp for stamp, later in itertools.pairwise(stamps))
 
 
 def check_images(stage, inboxes):
-    """Every pixel, number and stamp of what came."""
+    """Checks every pixel, number and stamp of the received images."""
     images = inboxes[FRONT + "image_raw"].found
-    # Best effort: a computer that does something else loses some.
+    # Best effort: a busy computer loses some.
     check(len(images) >= IMAGES / 2, f"{len(images)} of {IMAGES} images came")
     stamps = [image.stamp_ns() for image in images]
     check(grow(stamps), "the stamps of images do not grow")
@@ -288,7 +288,7 @@ def turn(q):
 
 
 def check_motion(stage, inboxes):
-    """Frames, poses, inertial readings, points."""
+    """Checks frames, poses, inertial readings, points."""
     fixed = {part.child_frame_id: part for part in inboxes["tf_static"].messages()[-1].transforms}
     parents = {child: part.header.frame_id for child, part in fixed.items()}
     tree = {"odom": "map", "front_optical_frame": "base_link", "top": "base_link"}
@@ -336,12 +336,12 @@ def check_motion(stage, inboxes):
 
 
 def check_on_demand(stage, domain):
-    """What is made only for who asks: JPEG and points of depth. Returns their subscribers."""
+    """Checks topics that are computed only for subscribers: JPEG and points of depth. Returns their subscribers."""
     jpegs = Inbox(domain, FRONT + "image_raw/compressed", ros.CompressedImage, SENSOR)
     clouds = Inbox(domain, FRONT + "depth/points", ros.PointCloud2, SENSOR)
     both = {inbox.name: inbox for inbox in (jpegs, clouds)}
     wait_for(lambda: jpegs.is_matched() and clouds.is_matched(), "nobody sends JPEG and points")
-    # Best effort: a computer that does something else loses some.
+    # Best effort: a busy computer loses some.
     for image in range(40):
         stage.publish()
         poll(both, 0.2)
@@ -354,7 +354,7 @@ def check_on_demand(stage, domain):
     check(jpeg.format == "jpeg" and pixels.shape == (HEIGHT, WIDTH, 3), f"a JPEG of {pixels.shape}")
     error = np.abs(pixels - stage.of(jpegs.found[-1].stamp_ns())[1]).mean()
     check(error < 4, f"JPEG is off by {error:.1f} on average")
-    # Behind the points stands one byte: whether all are finite; and what fills up to four.
+    # One byte follows the points: whether all are finite; then padding to four bytes.
     raw = clouds.found[-1]
     head = raw.data[:raw.data.index(b"rgb\0") + 256]
     count = WIDTH * HEIGHT
@@ -370,7 +370,7 @@ def check_on_demand(stage, domain):
 
 
 def twist(frame, x, turn=0.0):
-    """Returns a velocity along x and a turn about z. [m/s, rad/s]"""
+    """Returns a velocity along x and a rate about z. [m/s, rad/s]"""
     header = ros.Header(ros.Time(0, 0), frame)
     return ros.TwistStamped(header, ros.Twist(ros.Vector3(x, 0.0, 0.0), ros.Vector3(0.0, 0.0, turn)))
 
@@ -400,7 +400,7 @@ def answer_of(stage, expected, seconds=5.0):
 
 
 def check_commands(stage, sent, node):
-    """Velocities by frame and deadline, a path, a landing; and what is none of them."""
+    """Checks velocities by frame and deadline, a path, a landing; and invalid commands."""
     check(stage.publish() == Setpoint.hold(), "without a command the node does not hold")
     known: list[tuple[str, Literal["world", "heading", "body"]]] = [
         ("map", "world"), ("odom", "world"), ("base_stabilized", "heading"), ("base_link", "body")]
@@ -427,7 +427,7 @@ def check_commands(stage, sent, node):
 
 
 def check_restart(seq, inboxes):
-    """The runtime is started anew: the same node goes on, and the landing was the former flight's."""
+    """Restarts the runtime: the same node continues, and the landing of the previous flight has no effect."""
     stage = Stage()
     stage.seq = seq
     stage.start()
@@ -442,7 +442,7 @@ def check_restart(seq, inboxes):
 
 
 def fly(vizflyt_program, command, domain_id, domain):
-    """The simulated lab: takes off, is flown by velocities, lands. Sent reliably; depth in millimetres."""
+    """Flies the simulated lab: takes off, flies by velocities, lands. Reliable transport; depth in millimetres."""
     inboxes = {inbox.name: inbox for inbox in (
         Inbox(domain, FRONT + "image_raw", ros.Image, DEFAULT),
         Inbox(domain, FRONT + "depth/image_raw", ros.Image, DEFAULT),
@@ -500,13 +500,13 @@ def fly(vizflyt_program, command, domain_id, domain):
 
 
 def rows(stage, inboxes, seconds):
-    """Returns latency and load of what came within this time, a line for each topic; a plugin's own images first."""
+    """Returns latency and load of the messages within this time, a line for each topic; a plugin's own images first."""
     row = "{:<36} {:>5} {:>8} {:>6.1f} {:>7.2f} {:>7.2f}".format
     own_ms, size = np.array(stage.own_ns) / 1e6, stage.grid.nbytes + stage.depth_mm.nbytes
     lines = [row("(a plugin's own, in shared memory)", len(own_ms), size, size * len(own_ms) / seconds / 1e6,
                  *np.percentile(own_ms, [50, 95]))]
     for name, inbox in inboxes.items():
-        # Without a stamp of an image there is no latency.
+        # No latency for topics without an image's stamp.
         if not inbox.found or name.startswith("tf") or name == "vizflyt/imu":
             continue
         late_ns = [raw.came_ns - stage.of(raw.stamp_ns())[2] for raw in inbox.found]
@@ -527,7 +527,7 @@ def main():
         inboxes = subscribe(domain)
         stage.start()
         wait_for(lambda: all(inbox.is_matched() for inbox in inboxes.values()), "a topic is missing")
-        # The node hears of its subscribers between images.
+        # The node learns of its subscribers between images.
         for _ in range(5):
             stage.publish()
             poll(inboxes, 0.1)
@@ -551,11 +551,11 @@ def main():
         check_commands(stage, sent, node)
 
         stage.rehearsal.stop()
-        # Withdraws its offer.
+        # Withdraws its service.
         del stage.rehearsal
         check_restart(stage.seq, inboxes)
         check(node.end() == 0, "the node did not end cleanly")
-        # Clouds were on their way: a goodbye waits behind them.
+        # Clouds are still in flight: the unsubscription waits for them.
         deadline = time.monotonic() + 5
         while (left := [name for name, inbox in inboxes.items() if inbox.is_matched()]):
             check(time.monotonic() < deadline, f"the node left without a goodbye on {', '.join(left)}")

@@ -1,5 +1,5 @@
-"""ROS 2's messages as Cyclone DDS describes types, after their `.msg` files: fields, order, names on the wire."""
-# The types' names are keywords that their metaclass takes.
+"""ROS 2 messages as Cyclone DDS types, after their `.msg` files: fields, order, names on the wire."""
+# The type names are keyword arguments of the metaclass.
 # mypy: disable-error-code="call-arg"
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
     nanosec: uint32
 
     def ns(self) -> int:
-        """Returns it since 1970. [ns]"""
+        """Returns the time since 1970. [ns]"""
         return self.sec * 1_000_000_000 + self.nanosec
 
 

@@ -1,4 +1,4 @@
-"""Counts of tests, read from what the test runners print."""
+"""Counts of tests, read from the output of the test runners."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Runs the stages of `table.py`; `tests/run` calls it.
 
-Two lanes share the machine: stages that wait for real time run one at a time, and stages that compute fill the time
-that those leave (`tests/idle`), and then have all of it. Output goes to `target/tests/NAME.log`, and to the terminal
-where a stage fails.
+Stages run in two lanes: stages that wait for real time run one at a time, and computing stages use the remaining time
+(`tests/idle`), and then the complete machine. Output goes to `target/tests/NAME.log`, and to the terminal if a stage
+fails.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Run:
         self.total = 0
         self.is_stopped = False
         self.is_clock_busy = False
-        """Whether a stage that waits for real time runs: what computes beside it gives way."""
+        """A stage that waits for real time is running: computing stages get a lower priority."""
 
     def say(self, text: str) -> None:
         elapsed = int(time.monotonic() - self.started)
@@ -86,11 +86,11 @@ class Run:
                 start_new_session=True,
             )
             self.groups.add(child.pid)
-            # Not `wait`, which would not return the processor time of this child only.
+            # Not `wait`, which does not return the processor time of only this child.
             _, status, usage = os.wait4(child.pid, 0)
             child.returncode = os.waitstatus_to_exitcode(status)
             self.groups.discard(child.pid)
-        # Whatever it left running would disturb the next stage.
+        # Remaining processes would disturb the next stage.
         kill_group(child.pid)
         text = log.read_text(errors="replace")
         passed = child.returncode == 0
@@ -127,7 +127,7 @@ class Run:
             kill_group(group)
 
     def summary(self) -> int:
-        """Prints what failed and the totals; returns the exit status."""
+        """Prints failures and totals; returns the exit status."""
         print(f"\n{'seconds':>9} {'processor':>9}  stage")
         for result in self.results:
             if result.outcome != "skipped":
@@ -245,7 +245,7 @@ def choose(args: argparse.Namespace, record: changes.Record, crates: list[str] |
 
 
 def missing_needs(stages: Sequence[Stage]) -> dict[str, list[Need]]:
-    """Returns, by stage, what it needs and the machine lacks."""
+    """Returns the missing needs of each stage."""
     tested: dict[str, bool] = {}
     for need in {need.test: need for stage in stages for need in stage.needs}.values():
         tested[need.test] = subprocess.run(["bash", "-c", f"({need.test}) >/dev/null 2>&1"]).returncode == 0
@@ -254,7 +254,7 @@ def missing_needs(stages: Sequence[Stage]) -> dict[str, list[Need]]:
 
 
 def install_or_skip(missing: dict[str, list[Need]], chosen: list[Stage], run: Run, may_install: bool) -> list[Stage]:
-    """Installs what is missing with apt, after asking if there is a terminal; or leaves out the stages that need it."""
+    """Installs what is missing with apt, after asking if there is a terminal; or skips the stages that need it."""
     packages = sorted({word for needs in missing.values() for need in needs for word in need.package.split()})
     root = [] if os.geteuid() == 0 else ["sudo", "-n"]
     can_install = (
@@ -284,7 +284,7 @@ def install_or_skip(missing: dict[str, list[Need]], chosen: list[Stage], run: Ru
 
 
 def prepare_environment() -> None:
-    """A home that cannot be written: what tools keep there is kept in `target/home`."""
+    """Uses `target/home` as the home folder if the user's is not writable."""
     os.environ.setdefault("CARGO_TERM_COLOR", "never")
     home = os.environ.get("HOME", "")
     if not home or not os.access(home, os.W_OK):

@@ -1,4 +1,4 @@
-"""The stages of `tests/run`: what each runs, which tier it belongs to, what it needs, and which files it depends on.
+"""The stages of `tests/run`: command, tier, needs, and the files that each depends on.
 
 Tiers: `quick` runs with `--quick` too; `everyday` runs always; `heavy` runs with `--all`, and otherwise only if one of
 its `inputs` has changed since it last passed (`tests/all-passed.toml`).
@@ -13,18 +13,18 @@ from collections.abc import Sequence
 
 PROGRAM = "target/debug/vizflyt"
 EXAMPLES = "target/debug/examples"
-# The Python package's Rust.
+# Rust crate of the Python package.
 EXTENSION = "jetson/python/Cargo.toml"
 # The workspace without the crates that only heavy stages compile.
 WORKSPACE = "--locked --workspace --exclude vizflyt-ros2 --exclude vizflyt-fuzz"
-# The crates with features that no ordinary build has: always selected together, so that stages share one build.
+# Crates with features of no ordinary build; always selected together, so that stages share one build.
 FEATURED = "-p vizflyt -p vizflyt-ros2 -p vizflyt-bridge -p vizflyt-fuzz -p vizflyt-runtime -p vizflyt-server"
 FEATURES = "vizflyt/postgres,vizflyt/foxglove,vizflyt/ros2,vizflyt/crazyflie,vizflyt-bridge/net"
 
 
 @dataclasses.dataclass(frozen=True)
 class Need:
-    """A program, library or Python module that a stage uses, and the Debian package that has it."""
+    """A program, library or Python module that a stage uses, and its Debian package."""
 
     test: str
     """Shell command that succeeds if it is installed."""
@@ -85,10 +85,10 @@ class Stage:
     """Command in place of `command` with `--quick`; {crates} are the changed ones."""
 
 
-# Tests of heavy stages: the forest over twenty seeds; a plugin that is compiled and flown.
+# Tests of heavy stages: the forest with twenty seeds; a plugin that is compiled and flown.
 LONG = "test(over_many_seeds)"
 NEW = "test(a_new_rust_plugin)"
-# Tests that fly, serve or wait: they measure rates and latencies. The others compute, or have a virtual clock.
+# Tests that fly, serve or wait: they measure rates and latencies. The others compute, or use a virtual clock.
 CLOCKED = (
     "(package(/^vizflyt-(guardian|runtime|sdk|c|server|simulator|bridge)$/) - test(/^guard::tests::/)"
     f" + binary(flights)) - {LONG} - {NEW}"
@@ -107,7 +107,8 @@ STAGES = [
     # --- everyday: compute
     Stage("lint-rust", "lints of Rust", QUICK, COMPUTE,
           f"cargo clippy {WORKSPACE} --all-targets --quiet -- -D warnings"
-          # A workspace of its own. Not in the stage `python`: cargo lets only one stage at a time use target/debug, and
+          # A separate workspace. Not in the stage `python`: cargo lets only one stage at a time use target/debug, and
+          # that stage must not wait for one with lower priority.
           # that stage must not wait for one that gives way.
           " && PYO3_NO_PYTHON=1 cargo clippy --locked --quiet --target-dir target"
           f" --manifest-path {EXTENSION} -- -D warnings",

@@ -1,4 +1,4 @@
-// Measures how long a person waits for the program. See `run`.
+// Measures the user's waiting time after starting the program. See `run`.
 //
 //   node start.cjs VIZFLYT [--json]
 
@@ -65,7 +65,7 @@ function firstImage(url) {
         open = true;
         rest = rest.subarray(head + 4);
       }
-      // Frames that are whole messages, not masked; a long one's length is in the bytes after the second.
+      // Unfragmented, unmasked frames; the bytes after the second hold the length of a long one.
       while (rest.length >= 10) {
         const short = rest[1] & 0x7f;
         const [head, length] =
@@ -118,7 +118,7 @@ async function firstPicture(browser, url) {
 /** Returns the time that a process has taken of processors, with all of its threads. [ms] */
 function taken_ms({ pid }) {
   const fields = fs.readFileSync(`/proc/${pid}/stat`, "utf8").split(") ")[1].split(" ");
-  // User and system time, in hundredths of a second.
+  // User and system time, in units of 10 ms.
   return 10 * (Number(fields[11]) + Number(fields[12]));
 }
 
@@ -129,7 +129,7 @@ async function idle(scene, poses) {
   const server = start(["serve", scene, ...ports, "--leaderboard", "none", "--keys", keys, "--json"], scratch);
   const ready = JSON.parse((await server.line(/^\{"ready".*$/m))[0]);
   const vehicle = poses ? start(["sim", "--vicon", ready.vicon, "--mavlink", "udpin:127.0.0.1:0"], scratch) : null;
-  // What follows the start is over.
+  // Everything after the start is finished.
   await new Promise((done) => setTimeout(done, 2000));
   const before_ms = taken_ms(server.child);
   const began = performance.now();
@@ -158,7 +158,7 @@ async function measure() {
   const [, url] = await lab.line(/^page\s+(\S+)$/m);
   await firstImage(url);
   const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
-  // As tests/page starts it.
+  // As in tests/page.
   const browser = await chromium.launch({ executablePath, args: ["--no-sandbox", "--enable-unsafe-swiftshader"] });
   const pictures = [];
   for (let k = 0; k < PAGES; k++) pictures.push(await firstPicture(browser, url));

@@ -1,4 +1,5 @@
-"""Detects tags in a folder's images with pupil-apriltags and holds ours against it and against the truth."""
+"""Detects tags in a folder's images with pupil-apriltags, and compares this project's detections with it and with the
+truth."""
 
 import csv
 import pathlib
@@ -9,7 +10,7 @@ from pupil_apriltags import Detector
 
 
 def read(path):
-    """Corners (4 x 2, pixels) by image and id."""
+    """Returns corners (4 x 2, pixels) by image and id."""
     tags = {}
     for image, family, tag, *numbers in csv.reader(path.open()):
         assert family == "tag36h11"
@@ -44,7 +45,7 @@ def main():
             corners = np.asarray(tag.corners)
             middle = corners.mean(0)
             rim = middle + 1.15 * (corners - middle)
-            # Tags that the image's border cuts are not ours to find: their corners are the border's.
+            # The detector need not find tags cut by the image's border: their corners are at the border.
             whole = (rim >= 0).all() and (rim <= (width, height)).all()
             if tag.hamming <= 1 and tag.decision_margin >= 15 and whole:
                 theirs[int(path.stem), tag.tag_id] = corners
@@ -56,7 +57,7 @@ def main():
     missed = theirs.keys() - ours.keys()
     assert len(missed) <= 0.02 * len(theirs), f"missed: {sorted(missed)}"
     for key in both:
-        # Corners in another order would be an edge off.
+        # Corners in another order would differ by an edge length.
         apart = np.linalg.norm(ours[key] - theirs[key], axis=1)
         assert apart.max() < 3.0, f"{key}: {apart} px apart"
     ours_px = rms({key: ours[key] for key in both}, truth)

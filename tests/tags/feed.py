@@ -1,9 +1,10 @@
-"""A camera that fails: plays a flight's images as YUV4MPEG2, slower than they were exposed, and does what drivers do.
+"""A failing camera: plays a flight's images as YUV4MPEG2, later than they were exposed, with the faults of real
+drivers.
 
-The flight is flown there and back until the file END is there: a camera that is plugged in again starts this program,
-which on a loaded machine takes longer than any recording, and the other camera must still be there for it.
+Plays the flight forward and backward until the file END exists: a camera that is plugged in again starts this program,
+which takes longer on a loaded machine than any recording, and the other camera must still run then.
 
-Usage: feed.py FOLDER BEGIN_NS END [FAULT:FROM_S:TO_S ...]      faults: hang, repeat, dark, end; times of the first way
+Usage: feed.py FOLDER BEGIN_NS END [FAULT:FROM_S:TO_S ...]      faults: hang, repeat, dark, end; times of the first pass
 """
 
 import itertools
@@ -16,7 +17,7 @@ import cv2
 import numpy as np
 
 SLOWER = 3
-# Ways, after which nobody waits any more.
+# Maximum number of passes; the test has ended by then.
 WAYS = 20
 
 
@@ -29,7 +30,7 @@ def main() -> None:
     # The same for all cameras.
     way_s = math.ceil(stamps[-1][1]) - first_s
     there = [(name, stamp_s - first_s) for name, stamp_s in stamps]
-    # Without the images at both ends, which would be shown twice.
+    # Without the first and last image, which would be shown twice.
     back = [(name, way_s - time_s) for name, time_s in there[-2:0:-1]]
     ways = itertools.islice(itertools.cycle((there, back)), WAYS)
     opened_s = (time.monotonic_ns() - begin_ns) / 1e9 / SLOWER

@@ -1,7 +1,7 @@
-"""Reads a capture that `vizflyt scene generate --capture --tags` made, with pupil-apriltags and OpenCV alone.
+"""Reads a capture made by `vizflyt scene generate --capture --tags`, with only pupil-apriltags and OpenCV.
 
-The encoded video has as many images as stated, of the stated size, and tags are where the truth puts them, row by row
-of the rolling shutter.
+The encoded video has the stated number and size of images, and the tags are at the true positions, row by row of the
+rolling shutter.
 
 Usage: film.py VIZFLYT
 """
@@ -21,17 +21,17 @@ SECONDS, FRAMES = 40, 420
 
 
 def poses(image: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, and quaternions, at the upper edge, in the middle, at the lower edge."""
+    """Returns positions and quaternions at the exposure of the upper edge, the middle and the lower edge."""
     named = [image[key] for key in ("upper_edge", "world_from_cam", "lower_edge")]
     turns = np.array([pose["rotation_xyzw"] for pose in named])
-    # Neighbours on one side of the sphere.
+    # Neighbouring quaternions in the same hemisphere.
     turns[0] *= np.sign(turns[0] @ turns[1])
     turns[2] *= np.sign(turns[2] @ turns[1])
     return np.array([pose["position_m"] for pose in named]), turns, np.array([0.0, 0.5, 1.0])
 
 
 def corner_px(image: dict, camera: dict, corner_m: np.ndarray) -> np.ndarray | None:
-    """Where a point is seen in the row that is exposed when it is there; pixels' middles at +0.5."""
+    """Returns the pixel of a point in the row exposed at that moment; pixel centres at +0.5."""
     matrix = np.array([[camera["fx_px"], 0, camera["cx_px"]], [0, camera["fy_px"], camera["cy_px"]], [0, 0, 1]])
     lens = camera["distortion"]
     bend = np.array([lens[key] for key in ("k1", "k2", "p1", "p2", "k3")])
@@ -67,7 +67,7 @@ def main() -> None:
         layout = read_layout(film.with_suffix(".tags.toml"))
         assert [tag.number for tag in layout] == [tag["id"] for tag in truth["tags"]]
         camera = truth["camera"]
-        # ffmpeg decodes; OpenCV counts what it was given.
+        # ffmpeg decodes; OpenCV counts the images in its input.
         video = cv2.VideoCapture(str(film))
         detector = Detector(families="tag36h11", nthreads=2, quad_decimate=1.0, refine_edges=1)
         count, found, off, inward, false = 0, 0, [], [], 0
@@ -93,7 +93,7 @@ def main() -> None:
                 found += 1
                 seen.add(tag.tag_id)
                 half = placed.size_m / 2
-                # Low left first, counter-clockwise, as the detector lists them.
+                # Lower left first, counter-clockwise, in the detector's order.
                 for (x, y), corner in zip([(-1, -1), (1, -1), (1, 1), (-1, 1)], tag.corners, strict=True):
                     corner_m = placed.position_m + placed.rotation @ np.array([x * half, y * half, 0.0])
                     expected = corner_px(image, camera, corner_m)

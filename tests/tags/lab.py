@@ -1,11 +1,12 @@
-"""A lab of its own: what cameras see of printed tags, without a line of the code under test.
+"""An independent lab: renders camera images of printed tags without any of the code under test.
 
-Tags are OpenCV's (`cv2.aruco`), lenses OpenCV's distortion model, poses matrices. Every pixel is a ray: the lens is
-inverted at each pixel of an image three times as fine, the ray meets the tag's plane where the tag is while this row
-is exposed, and the ink there is averaged over the pixel and the exposure. Then blur and noise.
+Tags come from OpenCV (`cv2.aruco`), lenses follow OpenCV's distortion model, poses are matrices. Every pixel is a ray:
+the lens is inverted at each pixel of an image with three times the resolution, the ray intersects the tag's plane at
+the tag's pose while this row is exposed, and the ink there is averaged over the pixel and the exposure. Then blur and
+noise are added.
 
-Frames as in docs/COORDINATES.md: `world` (z up), `body` (forward, left, up), `cam` (right, down, forward). Pixels are
-OpenCV's here: the middle of the first is (0, 0).
+Frames as in docs/COORDINATES.md: `world` (z up), `body` (forward, left, up), `cam` (right, down, forward). Pixels
+follow OpenCV: the centre of the first is (0, 0).
 """
 
 import json
@@ -28,7 +29,7 @@ Pose = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass
 class Tag:
-    """A tag of a layout: where its middle is and how its axes lie (right, up, towards the reader)."""
+    """A tag of a layout: its centre and its axes (right, up, towards the reader)."""
 
     number: int
     size_m: float
@@ -37,7 +38,7 @@ class Tag:
 
 
 def rotation_of(x: float, y: float, z: float, w: float) -> np.ndarray:
-    """The matrix of a quaternion."""
+    """Returns the matrix of a quaternion."""
     x, y, z, w = np.array([x, y, z, w]) / np.linalg.norm([x, y, z, w])
     return np.array(
         [
@@ -49,7 +50,7 @@ def rotation_of(x: float, y: float, z: float, w: float) -> np.ndarray:
 
 
 def quaternion_of(rotation: np.ndarray) -> list[float]:
-    """The quaternion (x, y, z, w) of a matrix."""
+    """Returns the quaternion (x, y, z, w) of a matrix."""
     vector = cv2.Rodrigues(rotation)[0].ravel()
     angle = float(np.linalg.norm(vector))
     axis = vector / angle if angle > 0 else vector
@@ -57,7 +58,7 @@ def quaternion_of(rotation: np.ndarray) -> list[float]:
 
 
 def read_layout(path: pathlib.Path) -> list[Tag]:
-    """The tags of a layout file. tomllib is not in every Python that labs have."""
+    """Returns the tags of a layout file. Avoids tomllib, which some of the supported Python versions lack."""
     tags: list[dict] = []
     for line in path.read_text().splitlines():
         if line == "[[tags]]":
@@ -71,7 +72,7 @@ def read_layout(path: pathlib.Path) -> list[Tag]:
 
 
 def scale_layout(path: pathlib.Path, scale: float, output: pathlib.Path) -> None:
-    """Writes a layout whose every length is `scale` times as long."""
+    """Writes a layout with all lengths multiplied by `scale`."""
     lines = []
     for line in path.read_text().splitlines():
         key, _, value = line.partition(" = ")
@@ -84,12 +85,12 @@ def scale_layout(path: pathlib.Path, scale: float, output: pathlib.Path) -> None
 
 
 def fixed(rotation: np.ndarray, position_m: np.ndarray) -> Pose:
-    """What does not move."""
+    """Returns the constant pose of a static object."""
     return lambda t_s: (np.broadcast_to(rotation, (len(t_s), 3, 3)), np.broadcast_to(position_m, (len(t_s), 3)))
 
 
 def looking(from_m: np.ndarray, to_m: np.ndarray, roll_rad: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """A camera at a place that looks at another, upright but for `roll_rad`: rotation and position."""
+    """Returns rotation and position of a camera that looks from one point at another, upright except for `roll_rad`."""
     z = (to_m - from_m) / np.linalg.norm(to_m - from_m)
     up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
     x = np.cross(z, up)
@@ -99,7 +100,7 @@ def looking(from_m: np.ndarray, to_m: np.ndarray, roll_rad: float = 0.0) -> tupl
 
 
 def turned(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """Rotations of yaw about z, then pitch about y, then roll about x. [rad]"""
+    """Returns rotations of yaw about z, then pitch about y, then roll about x. [rad]"""
     (cz, cy, cx), (sz, sy, sx) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
     rows = [
         [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
@@ -111,7 +112,7 @@ def turned(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Lens:
-    """A lens by OpenCV's model, principal point from the middle of the first pixel."""
+    """A lens with OpenCV's model; the principal point is relative to the centre of the first pixel."""
 
     width: int = 960
     height: int = 600
@@ -121,7 +122,7 @@ class Lens:
     distortion: np.ndarray = field(default_factory=lambda: np.array([-0.13, 0.035, 0.0006, -0.0008, 0.0]))
 
     def __post_init__(self) -> None:
-        # Where the rays of the fine image go, once for each lens.
+        # Rays of the fine image, computed once for each lens.
         across = (np.arange(self.width * FINE) + 0.5) / FINE - 0.5
         down = (np.arange(self.height * FINE) + 0.5) / FINE - 0.5
         pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 1, 2)
@@ -130,13 +131,13 @@ class Lens:
         self.slopes = slopes.reshape(self.height * FINE, self.width * FINE, 2).astype(np.float32)
 
     def project(self, p_cam: np.ndarray) -> np.ndarray:
-        """Pixels of points ahead of the camera (n x 3)."""
+        """Returns the pixels of points ahead of the camera (n x 3)."""
         return cv2.projectPoints(p_cam, np.zeros(3), np.zeros(3), self.matrix, self.distortion)[0].reshape(-1, 2)
 
 
 @dataclass
 class Sensor:
-    """How images are exposed."""
+    """Exposure of the images."""
 
     exposure_s: float = 0.004
     # From the first row's exposure to the last one's; the stamp is the middle row's.
@@ -146,24 +147,24 @@ class Sensor:
 
 
 class Camera:
-    """Takes pictures of tags that stand or move."""
+    """Takes pictures of static or moving tags."""
 
     def __init__(self, lens: Lens, pose: Pose, sensor: Sensor, seed: int) -> None:
         self.lens, self.pose, self.sensor = lens, pose, sensor
         self.random = np.random.default_rng(seed)
         shape = (lens.height, lens.width)
         self.noises = [self.random.normal(0, sensor.noise, shape).astype(np.float32) for _ in range(3)]
-        # A wall of soft spots; it does not move with the camera, and no tag is read from it.
+        # A wall of soft spots; it does not move with the camera, and contains no tag.
         spots = self.random.normal(0, 1, (lens.height // 24 + 1, lens.width // 24 + 1)).astype(np.float32)
         self.wall = WALL + 14 * cv2.resize(spots, (lens.width, lens.height), interpolation=cv2.INTER_CUBIC)
 
     def leave(self, tags: list[Tag], pose: Pose) -> None:
-        """Leaves tags where they do not move against the camera: they are part of the wall from now on."""
+        """Adds tags that do not move relative to the camera to the wall."""
         for tag in tags:
             self._paint(self.wall, tag, pose, 0.0)
 
     def image(self, groups: list[tuple[list[Tag], Pose]], t_s: float) -> np.ndarray:
-        """What is seen at an instant, the middle row's."""
+        """Returns the image at an instant, that of the middle row."""
         canvas = self.wall.copy()
         shown = []
         now = np.array([t_s])
@@ -195,7 +196,7 @@ class Camera:
         sensor, height = self.sensor, self.lens.height
         half = tag.size_m * RIM / 2
         square = np.array([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]])
-        # Where it may be while the image is exposed.
+        # Positions of the tag while the image is exposed.
         span_s = (sensor.readout_s + sensor.exposure_s) / 2
         corners = []
         for moment in (t_s - span_s, t_s, t_s + span_s):
@@ -219,7 +220,7 @@ class Camera:
         for moment in (np.arange(3) - 1) / 3 * sensor.exposure_s if sensor.exposure_s > 0 else [0.0]:
             times_s = t_s + moment + rows * sensor.readout_s
             rotation, position = self._tag_in_cam(tag, pose, times_s)
-            # A ray meets the plane at (x, y) of the tag: the inverse of [right, up, middle].
+            # A ray intersects the plane at (x, y) of the tag: the inverse of [right, up, middle].
             inverse = np.linalg.inv(np.stack([rotation[:, :, 0], rotation[:, :, 1], position], axis=2))
             met = np.einsum("rij,rcj->rci", inverse.astype(np.float32), rays)
             place = met[..., :2] / met[..., 2:] / (2 * half) * [1, -1] + 0.5
@@ -239,12 +240,12 @@ _textures: dict[tuple[int, int], np.ndarray] = {}
 
 
 def texture(number: int, cell_px: float) -> tuple[np.ndarray, int]:
-    """A tag with its rim, as fine as it is looked at; and pixels per cell."""
+    """Returns a tag with its rim at a suitable resolution, and its pixels per cell."""
     fine = int(min(max(2 ** round(np.log2(max(cell_px, 1))), 4), 64))
     if (number, fine) not in _textures:
         family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
         cells = cv2.aruco.generateImageMarker(family, number, 8)
-        # OpenCV's tags stand on their heads as the AprilTag library's reader holds them.
+        # OpenCV's tags are upside down in the AprilTag library's convention.
         bits = np.pad(np.rot90(cells > 0, 2), 1, constant_values=True)
         picture = np.where(bits, WHITE, BLACK).astype(np.float32)
         _textures[number, fine] = np.kron(picture, np.ones((fine, fine), np.float32))
@@ -260,6 +261,6 @@ def write_images(folder: pathlib.Path, images: list[np.ndarray], stamps_s: list[
 
 
 def write_stamps(folder: pathlib.Path, stamps_s: list[float]) -> None:
-    """Stamps of a folder's images."""
+    """Writes the stamps of a folder's images."""
     lines = [f"{index}.pgm,{round(stamp * 1e9)}" for index, stamp in enumerate(stamps_s)]
     (folder / "stamps.csv").write_text("name,stamp_ns\n" + "\n".join(lines) + "\n")

@@ -13,7 +13,7 @@ import numpy as np
 from pupil_apriltags import Detector
 
 DPI = 200
-# Two pixels of a tag's edge: what the detector's corners may be off at this resolution.
+# Two pixels: tolerance of the detector's corners at this resolution.
 TOLERANCE_M = 2 * 0.0254 / DPI
 
 PRINTS = {
@@ -24,7 +24,8 @@ PRINTS = {
 
 
 def layout(path):
-    """The tags of a layout file: id to size. tomllib is not in every Python that labs have."""
+    """Returns the tags of a layout file: id to size. Avoids tomllib, which some of the supported Python versions
+    lack."""
     tags = {}
     for line in path.read_text().splitlines():
         key, _, value = line.partition(" = ")
@@ -36,7 +37,7 @@ def layout(path):
 
 
 def image(path):
-    """A binary PGM as pdftoppm writes it."""
+    """Reads a binary PGM as written by pdftoppm."""
     magic, size, most, pixels = path.read_bytes().split(b"\n", 3)
     assert (magic, most) == (b"P5", b"255"), (magic, most)
     width, height = (int(n) for n in size.split())
@@ -74,5 +75,5 @@ def main():
 
 
 main()
-# The package's detector frees memory twice when it goes, at times; all has been checked by now.
+# The package's detector sometimes frees memory twice when it is destroyed; all checks are done by now.
 os._exit(0)

@@ -1,7 +1,7 @@
-"""The walk of a lab by tags, from the printer to the pose, on images of a generator of its own (lab.py); then what
-goes wrong in labs: clocks apart, a bumped camera, a shrunk print, a rolling shutter.
+"""Complete setup of a lab with tags, from the printer to the pose, on independently rendered images (lab.py); then
+common faults: clock offsets, a bumped camera, a shrunk print, a rolling shutter.
 
-Usage: walk.py VIZFLYT [ROW ...]      rows by their names; without any, all
+Usage: walk.py VIZFLYT [ROW ...]      rows by name; default: all
 """
 
 import json
@@ -36,15 +36,15 @@ EYES = {
     "right": looking(np.array([3.0, -2.1, 2.3]), np.array([-0.3, 0.2, 0.9]), -0.03),
 }
 RATE_HZ = 30.0
-# When in its interval each camera is exposed: webcams run free.
+# Time of each camera's exposure within its interval: webcams are not synchronised.
 PHASE = {"left": 0.0, "right": 0.45}
 SECONDS = 6.0
 BEGIN_S = 100.0
 
 
 def path(speed_mps: float) -> Pose:
-    """A flight through the cage: a lying eight, the vehicle leaning into its turns and turning about itself. It stands
-    for 0.3 s, then speeds up within a second."""
+    """Returns a flight through the cage: a horizontal figure eight, with the vehicle banking into its turns and yawing.
+    It stands for 0.3 s, then reaches its speed within a second."""
 
     def way(t_s: np.ndarray) -> np.ndarray:
         t = np.maximum(t_s - BEGIN_S - 0.3, 0)
@@ -68,14 +68,14 @@ def path(speed_mps: float) -> Pose:
 
 
 class Lab:
-    """A folder in which a lab is set up by the program's own commands."""
+    """A folder in which a lab is set up with the program's own commands."""
 
     def __init__(self, vizflyt: str, home: pathlib.Path) -> None:
         self.vizflyt, self.home = vizflyt, home
         self.lens = Lens()
 
     def tags(self, *args: str, refused: bool = False) -> str:
-        """Runs `vizflyt tags`; returns what it printed."""
+        """Runs `vizflyt tags`; returns its output."""
         done = subprocess.run(
             [self.vizflyt, "tags", *args], cwd=self.home, capture_output=True, text=True, check=False
         )
@@ -101,7 +101,7 @@ class Lab:
         assert abs(middle - 0.5 - self.lens.matrix[0, 2]) < 1.5, middle
 
     def wave_board(self, folder: str, lens: Lens, depth_m: float, reach: tuple[float, float]) -> None:
-        """Renders the board all over an image, tilted to all sides: its middle reaches these slopes."""
+        """Renders the board in all parts of an image, tilted in all directions; its centre reaches these slopes."""
         board = self.layout("board")
         random = np.random.default_rng(1)
         camera = Camera(lens, fixed(np.eye(3), np.zeros(3)), Sensor(exposure_s=0), 2)
@@ -120,7 +120,7 @@ class Lab:
         return float(line.split(" = ")[1])
 
     def camera_pose(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Where a camera's file says that it is."""
+        """Returns the pose in a camera's file."""
         lines = (self.home / f"{name}.toml").read_text().split("[world_from_cam]")[1].splitlines()
         values = dict(line.split(" = ") for line in lines if line)
         return rotation_of(*json.loads(values["rotation_xyzw"])), np.array(json.loads(values["position_m"]))
@@ -163,7 +163,7 @@ class Lab:
             print(f"  {name} is {off_mm:.1f} mm off", flush=True)
             assert off_mm < 10, name
         assert "of its layout's size" in out, out
-        # A cube printed at 97 %, as far as its layout knows.
+        # A cube printed at 97 %: its layout states the nominal size.
         scale_layout(self.home / "cube.toml", 1 / 0.97, self.home / "large.toml")
         kept = {name: (self.home / f"{name}.toml").read_text() for name in EYES}
         shrunk = self.survey_cameras("large").splitlines()[-1]
@@ -197,7 +197,7 @@ class Lab:
         (self.home / "lab.toml").write_text(f"cameras = {cameras}\nlayouts = {files}\n")
 
     def bump(self, name: str) -> None:
-        """Writes into a camera's file that it is elsewhere than it is: by 2.4 cm and 0.7 degrees."""
+        """Moves the pose in a camera's file away from the true one: by 2.4 cm and 0.7 degrees."""
         file = self.home / f"{name}.toml"
         rotation, position = self.camera_pose(name)
         turned_by = turned(*(np.array([x]) for x in np.radians([0.5, 0.4, -0.3])))[0]
@@ -215,7 +215,7 @@ class Lab:
 
 
 def figures(lines: list[dict], truth: Pose) -> dict[str, float]:
-    """How far located poses are from the truth, and from what they say themselves."""
+    """Returns the errors of located poses, and their size relative to the reported uncertainty."""
     poses = [line for line in lines if "vizflyt_pose" in line]
     stamps = np.array([pose["stamp_ns"] for pose in poses]) / 1e9
     assert (np.diff(stamps) > 0).all(), "stamps go back"
@@ -237,7 +237,7 @@ def figures(lines: list[dict], truth: Pose) -> dict[str, float]:
         "p99_mm": 1e3 * float(np.quantile(distance, 0.99)),
         "rms_deg": float(np.degrees(np.sqrt(np.mean((turn**2).sum(1))))),
         "sigma_mm": 1e3 * float(np.median(np.linalg.norm(sigma, axis=1))),
-        # Their mean over the axes: NEES / 3.
+        # Mean over the axes: NEES / 3.
         "nees": float(np.mean((off / sigma) ** 2)),
         "turn_nees": float(np.mean((turn / turn_sigma) ** 2)),
         "px": float(np.median([pose["quality"]["rms_px"] for pose in poses])),
@@ -260,10 +260,10 @@ def main() -> None:
 
 @dataclass
 class Row:
-    """What is wrong with a lab, and how well its flight must be located all the same."""
+    """A fault of a lab, and the required accuracy of its flight despite it."""
 
     flight: str = "slow"
-    # By how much the right camera's stamps are late, and what its file says of it.
+    # Delay of the right camera's stamps, and the delay stated in its file.
     late_s: float = 0.0
     latency_ms: float = 0.0
     cube: str = "cube"
@@ -271,7 +271,7 @@ class Row:
     bumped: str = ""
     rms_mm: float = 4.0
     rms_deg: float = 0.8
-    # What is said to be wrong; each the beginning and the end of a finding.
+    # Expected findings; the beginning and the end of each.
     findings: tuple[tuple[str, str], ...] = ()
 
 
@@ -322,7 +322,7 @@ def rows(lab: Lab, wanted: list[str]) -> None:
 def check(row: Row, values: dict[str, float], report: dict) -> None:
     assert values["rms_mm"] < row.rms_mm, "poses are off"
     assert values["rms_deg"] < row.rms_deg, "attitudes are off"
-    # Squared errors in units of the sigma that is sent: 1 is exact.
+    # Squared errors in units of the reported sigma: 1 is exact.
     assert 0.3 < values["nees"] < 2.5, "sigma is not honest"
     assert 0.2 < values["turn_nees"] < 2.5, "sigma of the attitude is not honest"
     assert values["poses"] >= 0.98 * values["sets"], report
@@ -333,13 +333,13 @@ def check(row: Row, values: dict[str, float], report: dict) -> None:
 
 
 INSIDE_OUT = "under the vehicle"
-# The camera looks straight down, the image's top towards the nose; its lens is 80 mm above the soles.
+# The camera looks straight down, the image's top towards the nose; its lens is 80 mm above the feet.
 BODY_FROM_CAM = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 LENS_M = np.array([0.02, 0.0, 0.08])
 
 
 def up_and_down(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A flight from a pad and back onto it: stands, climbs to 1.2 m, flies a circle, lands; turning all the while."""
+    """Returns a flight from a pad and back: stands, climbs to 1.2 m, flies a circle, lands; yaws all the time."""
 
     def smooth(begin_s: float, end_s: float) -> np.ndarray:
         share = np.clip((t_s - BEGIN_S - begin_s) / (end_s - begin_s), 0, 1)
@@ -353,7 +353,7 @@ def up_and_down(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def carried(body: Pose, rotation: np.ndarray, place_m: np.ndarray) -> Pose:
-    """What sits on a vehicle."""
+    """Returns the pose of a part mounted on a vehicle."""
 
     def pose(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         r, p = body(t_s)
@@ -363,8 +363,8 @@ def carried(body: Pose, rotation: np.ndarray, place_m: np.ndarray) -> Pose:
 
 
 def inside_out(lab: Lab) -> None:
-    """The camera is under the vehicle, over a mat that a person has laid by a tape: printed, calibrated, surveyed,
-    located, from the floor up and down to it."""
+    """The camera is under the vehicle, above a mat laid with a tape measure: printed, calibrated, surveyed, located,
+    from take-off to landing."""
     focal = 270.0
     lens = Lens(
         width=640,
@@ -380,12 +380,12 @@ def inside_out(lab: Lab) -> None:
     random = np.random.default_rng(11)
     laid = lab.layout("floor")
     for tag in laid:
-        # Large sheets lie where a tape says; small ones are printed together.
+        # Large sheets are placed with a tape measure; small ones are printed together.
         if tag.size_m > 0.1:
             tag.position_m = tag.position_m + np.array([*random.normal(0, 0.004, 2), 0])
             tag.rotation = turned(*(np.array([x]) for x in (random.normal(0, 0.01), 0.0, 0.0)))[0]
     still = fixed(np.eye(3), np.zeros(3))
-    # A walk over all of it, and low over the pad.
+    # A walk over the whole mat, and at low height over the pad.
     places = [np.array([x, y, 0.9]) for x in np.linspace(-1.1, 1.1, 6) for y in np.linspace(-0.8, 0.8, 4)]
     places += [np.array([x, y, 0.35]) for x in (-0.15, 0.0, 0.15) for y in (-0.1, 0.1)]
     images = []
@@ -398,7 +398,7 @@ def inside_out(lab: Lab) -> None:
     out = lab.tags("survey", "mat", "floor-walk", *survey)
     print("survey mat:", out.splitlines()[-2], sep="\n  ", flush=True)
 
-    # Mounted by a ruler and the mat's level: 1.5 mm and 1.5 mrad off along and about each axis.
+    # Mounted with a ruler and the mat's level: errors of 1.5 mm and 1.5 mrad along and about each axis.
     tilt = turned(*(np.array([x]) for x in (-0.0015, 0.0015, 0.0015)))[0]
     place_m = LENS_M + np.array([0.0015, -0.0015, -0.0015])
     camera = Camera(lens, carried(up_and_down, BODY_FROM_CAM @ tilt, place_m), Sensor(), 40)
@@ -424,7 +424,7 @@ def inside_out(lab: Lab) -> None:
 
 
 class Server:
-    """A render server that takes poses by JSON packets."""
+    """A render server that takes poses as JSON packets."""
 
     def __init__(self, lab: Lab) -> None:
         make = [lab.vizflyt, "scene", "generate", "room", "--seed", "3", "-o", "hall"]
@@ -446,15 +446,15 @@ class Server:
         self.poses = source["address"]
 
     def end(self) -> str:
-        """Ends it; returns what it said."""
+        """Stops it; returns its output."""
         self.process.send_signal(signal.SIGINT)
         self.process.communicate(timeout=30)
         return self.log.read_text()
 
 
 def cameras_come_and_go(lab: Lab) -> None:
-    """A camera that hangs, repeats, goes dark and is unplugged is named, and is taken back; the other goes on. A render
-    server that gets the poses tells its people so."""
+    """A camera that hangs, repeats images, goes dark or is unplugged is reported, and used again afterwards; the other
+    continues. A render server that gets the poses shows this to its users."""
     server = Server(lab)
     begin_ns = time.monotonic_ns() + 2 * 10**9
     faults = ["hang:1:1.7", "repeat:2.2:2.7", "dark:3.2:3.7", "end:4.2:4.3"]
@@ -485,7 +485,7 @@ def cameras_come_and_go(lab: Lab) -> None:
                 located.send_signal(signal.SIGINT)
                 break
     right = [fault for camera, fault in events if camera == "right"]
-    # Until the flight begins both are silent.
+    # Both are silent until the flight begins.
     while right and right[0] is not None:
         right.pop(0)
     right.pop(0)

@@ -1,4 +1,4 @@
-"""Reads a real VRPN server with `vizflyt doctor localization`; see `run` beside this file."""
+"""Reads a real VRPN server with `vizflyt doctor localization`; see `run` in this folder."""
 
 import pathlib
 import queue
@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 
-# A tracker with two sensors that stand in the origin, and one that turns about z.
+# A tracker with two sensors at the origin, and one that rotates about z.
 TRACKERS = """vrpn_Tracker_NULL Tracker0 2 60.0
 vrpn_Tracker_Spin wasp 1 100.0 0.0 0.0 1.0 0.25
 """
@@ -18,7 +18,7 @@ checks = 0
 
 
 def check(condition: bool, what: str) -> None:
-    """Counts a check that holds; ends the program at one that does not."""
+    """Counts a check that passed; ends the program at one that failed."""
     global checks
     if not condition:
         sys.exit(f"FAILED: {what}")
@@ -27,20 +27,20 @@ def check(condition: bool, what: str) -> None:
 
 
 class Server:
-    """A running vrpn_server, on loopback alone."""
+    """A running vrpn_server, only on loopback."""
 
     def __init__(self, program: str, config: pathlib.Path, port: int) -> None:
         command = [program, "-f", str(config), "-NIC", "127.0.0.1", str(port)]
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def kill(self) -> None:
-        """Ends it without a word, as a crash does."""
+        """Kills it, like a crash."""
         self.process.kill()
         self.process.wait()
 
 
 class Doctor:
-    """A running `vizflyt doctor localization --watch`, whose lines are read as they come."""
+    """A running `vizflyt doctor localization --watch`, with its output as lines."""
 
     def __init__(self, program: str, pose: str) -> None:
         command = [program, "doctor", "localization", "--watch", "--pose", pose]
@@ -54,7 +54,7 @@ class Doctor:
             self.lines.put(line.rstrip())
 
     def until(self, pattern: str, within_s: float = 30.0) -> str:
-        """Returns the next line that has `pattern`, or an empty one if none comes in time."""
+        """Returns the next line that matches `pattern`, or an empty one after the timeout."""
         end = time.monotonic() + within_s
         while (left := end - time.monotonic()) > 0:
             try:
@@ -72,7 +72,7 @@ class Doctor:
 
 
 def free_port() -> int:
-    """Returns a TCP port of loopback that nobody has."""
+    """Returns a free TCP port on loopback."""
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         return int(sock.getsockname()[1])
@@ -88,10 +88,10 @@ def main() -> None:
 
         doctor = Doctor(vizflyt, f"{at},objects.vizflyt=wasp")
         line = doctor.until(r"^note .*cannot connect to")
-        check("refused" in line, "a server that is not there is named")
+        check("refused" in line, "a missing server is named")
         server = Server(program, config, port)
         line = doctor.until(r"^pose ")
-        check("at x 0.00, y 0.00" in line and "up is +z" in line, f"poses come: {line}")
+        check("at x 0.00, y 0.00" in line and "up is +z" in line, f"poses arrive: {line}")
         turned = {doctor.until(r"^pose ").split(",")[0] for _ in range(3)}
         check(len(turned) > 1, f"the tracker turns: {sorted(turned)}")
         server.kill()
@@ -101,7 +101,7 @@ def main() -> None:
         started = time.monotonic()
         line = doctor.until(r"^(pose|note) ")
         took_s = time.monotonic() - started
-        check(line.startswith("pose"), f"its next start is followed, {took_s:.1f} s after it: {line}")
+        check(line.startswith("pose"), f"reconnects {took_s:.1f} s after a restart: {line}")
         doctor.end()
 
         doctor = Doctor(vizflyt, at)

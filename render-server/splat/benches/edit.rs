@@ -1,4 +1,5 @@
-//! Editing a scene: one million splats of a room, of degree 3, beside what reading and writing them takes.
+//! Benchmark of scene edits: one million splats of a room, of degree 3, compared with the time for reading and
+//! writing them.
 //!
 //! `cargo bench -p vizflyt-splat --bench edit`; the target is a second for any step on two cores.
 
@@ -10,13 +11,13 @@ use vizflyt_splat::Splats;
 use vizflyt_splat::edit::{Carve, EditStep, Region};
 use vizflyt_splat::format::{self, Format};
 
-/// Splats of the scene.
+/// Number of splats of the scene.
 const COUNT: usize = 1_000_000;
 
-/// Makes a room of 8 x 6 x 3 m with a twentieth of it as haze and floaters, in and around it.
+/// Returns a room of 8 x 6 x 3 m; a twentieth of its splats is haze and floaters, in and around it.
 fn room() -> Splats {
     let mut state = 0x9e37_79b9_7f4a_7c15u64;
-    // xorshift64*, to 0..1.
+    // xorshift64*, scaled to 0..1.
     let mut random = move || {
         state ^= state >> 12;
         state ^= state << 25;

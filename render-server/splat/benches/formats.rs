@@ -1,4 +1,4 @@
-//! Loading scenes of every format: one million splats, from bytes in memory to [`Splats`].
+//! Benchmark of loading scenes of every format: one million splats, from bytes in memory to [`Splats`].
 //!
 //! `cargo bench -p vizflyt-splat --bench formats`; the target is a second each on two cores.
 
@@ -9,14 +9,14 @@ use glam::{Quat, Vec3};
 use vizflyt_splat::Splats;
 use vizflyt_splat::format::{self, Format};
 
-/// Splats per scene.
+/// Number of splats per scene.
 const COUNT: usize = 1_000_000;
 
-/// Makes splats as a capture has them: clustered positions, log-normal sizes, harmonics that fade
-/// with their degree.
+/// Returns splats similar to those of a capture: clustered positions, log-normal sizes, harmonics that fade with
+/// their degree.
 fn scene(count: usize, sh_degree: u8) -> Splats {
     let mut state = 0x9e37_79b9_7f4a_7c15u64;
-    // xorshift64*, to -1..1.
+    // xorshift64*, scaled to -1..1.
     let mut random = move || {
         state ^= state >> 12;
         state ^= state << 25;

@@ -1,18 +1,17 @@
-//! Images per second of the renderer for graphics cards, and the milliseconds of its passes, by
-//! number of splats and cameras.
+//! Benchmark of the GPU renderer: images per second and milliseconds per pass, by number of splats and cameras.
 //!
 //! ```text
 //! cargo bench -p vizflyt-splat --bench gpu [-- [--out FOLDER] [--counts 100000,1000000]
 //!     [--cameras 1,2,4,8] [--size 640x480] [--seconds 2] [--only NAME]]
 //! ```
 //!
-//! Takes the first adapter, software ones last. Scenes are generated halls with harmonics of degree
-//! 3, those of a million splats and more in adaptive detail too, and the captured ones of a neighbouring `../shared` where present. `--out` leaves the scenes as
-//! PLY, the cameras, the first image of each scene and all figures there: `tests/gpu/table` gives
-//! them to gsplat.
+//! Uses the first adapter; software adapters are last. Scenes are generated halls with harmonics of degree 3, from a
+//! million splats on also in adaptive detail, and the captured scenes of a neighbouring `../shared`, if present.
+//! `--out` writes the scenes as PLY, the cameras, the first image of each scene and all results: `tests/gpu/table`
+//! passes them to gsplat.
 //!
-//! Passes are timed by the device, the call by the host: it ends with the images in the caller's
-//! memory; the processor's renderer renders the same beside it. "Pipelined" has two ticks under way ([`GpuRenderer::begin`]).
+//! Passes are timed by the device, the call by the host; the call ends with the images in the caller's memory. The
+//! CPU renderer renders the same for comparison. "Pipelined" has two ticks in flight ([`GpuRenderer::begin`]).
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -24,18 +23,18 @@ use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
 use vizflyt_splat::gpu::{Adapter, Budget, GpuRenderer};
 use vizflyt_splat::{Camera, CpuRenderer, Detail, PassTimes, Rasterizer, RgbdImage, Splats, ply};
 
-/// What the command line asks for.
+/// Command-line options.
 struct Options {
     out: Option<PathBuf>,
     counts: Vec<usize>,
     cameras: Vec<usize>,
     size: (u32, u32),
     seconds: f32,
-    /// Part of a scene's name.
+    /// Substring of the scene's name.
     only: String,
 }
 
-/// A scene, and the cameras that see it.
+/// Scene with its cameras.
 struct Case {
     name: String,
     splats: Splats,
@@ -44,14 +43,14 @@ struct Case {
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    // `cargo test` runs benches too, without this flag: nothing to test here.
+    // `cargo test` also runs benches, but without this flag; then nothing is measured.
     if !arguments.iter().any(|argument| argument == "--bench") {
         return;
     }
     let options = options(&arguments);
     let adapters = Adapter::all();
     let Some(adapter) = adapters.first() else {
-        println!("no graphics adapter: no figures");
+        println!("no graphics adapter: nothing is measured");
         return;
     };
     let kind = if adapter.name().is_software { ", a software adapter" } else { "" };
@@ -132,7 +131,7 @@ fn measure(
         let mut render_one = |gpu: &mut GpuRenderer| {
             gpu.render(&[], cameras, &mut images).expect("valid cameras and a device")
         };
-        // Buffers grow and clocks rise.
+        // Warm-up: buffers grow and clock rates rise.
         for _ in 0..3 {
             render_one(&mut gpu);
         }
@@ -184,7 +183,7 @@ fn measure(
             work.pairs,
             cells.join(" | ")
         );
-        // Who is compared with us renders every splat.
+        // The renderers that are compared with this one render every splat.
         if detail == Detail::Full {
             rows.push(json!({
                 "scene": case.name, "splats": case.splats.len(), "cameras": count,
@@ -194,25 +193,25 @@ fn measure(
     }
 }
 
-/// A hall of 24 by 24 m with 60 pillars, covered with surfels; cameras in its middle, each turned
-/// an eighth of a circle from the last.
+/// Returns a hall of 24 by 24 m with 60 pillars, covered with surfels, and cameras in its middle, each rotated by an
+/// eighth of a circle from the last.
 fn hall(count: usize, options: &Options) -> Case {
     let mut state = 0x9e37_79b9_7f4a_7c15_u64;
     let mut random = move |low: f32, high: f32| {
-        // Knuth's MMIX generator; its upper 24 bits.
+        // Knuth's MMIX generator; uses its upper 24 bits.
         state =
             state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         low + (state >> 40) as f32 / (1u64 << 24) as f32 * (high - low)
     };
     let mut splats = Splats { sh_degree: 3, ..Splats::default() };
-    // So that more splats are smaller ones, of the same total area.
+    // More splats are smaller, with the same total area.
     let size = 0.06 * (100_000.0 / count as f32).sqrt();
     for i in 0..count {
         let mean = match i % 5 {
             0 => Vec3::new(random(-12.0, 12.0), random(-12.0, 12.0), random(-0.02, 0.02)),
             1 => Vec3::new(random(-12.0, 12.0), random(-12.0, 12.0), 4.0 + random(-0.02, 0.02)),
             2 => {
-                // Rough as all else: on a wall that is flat to the bit, no two renderers have one order.
+                // Rough like the rest: on an exactly flat wall, each renderer blends in a different order.
                 let rough = random(-0.02, 0.02);
                 let (along, side) = (random(-12.0, 12.0), 12.0 * (i % 2 * 2) as f32 - 12.0 + rough);
                 let z = random(0.0, 4.0);
@@ -233,7 +232,7 @@ fn hall(count: usize, options: &Options) -> Case {
         splats.opacities.push(random(0.3, 1.0));
         splats.sh.extend((0..48).map(|k| random(-1.0, 1.0) / if k < 3 { 1.0 } else { 8.0 }));
     }
-    // Camera axes in the world: right, down, ahead.
+    // Camera axes in the world: right, down, forward.
     let ahead = DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X);
     let (width, height) = options.size;
     let intrinsics = Intrinsics::from_horizontal_fov(width, height, 90f64.to_radians());
@@ -247,7 +246,7 @@ fn hall(count: usize, options: &Options) -> Case {
     Case { name: format!("hall_{}k", count / 1000), splats, cameras }
 }
 
-/// The scenes of `../shared`, at the reference poses and both sizes: one camera each.
+/// Returns the scenes of `../shared`, at the reference poses and both sizes: one camera each.
 fn captured() -> Vec<Case> {
     #[derive(Deserialize)]
     struct File {
@@ -300,8 +299,8 @@ fn camera(intrinsics: Intrinsics, world_from_cam: Pose<World, Cam>) -> Camera {
     Camera::new(intrinsics, world_from_cam, 0.01)
 }
 
-/// Leaves what another renderer needs to render the same: the scene, its cameras in the oracle's form,
-/// and our first image as f32.
+/// Writes the input for another renderer: the scene, its cameras in the oracle's format, and this renderer's first
+/// image as f32.
 fn leave(case: &Case, adapter: &Adapter, out: &Path) {
     let file = |extension: &str| out.join(&case.name).with_extension(extension);
     std::fs::create_dir_all(out).expect("a folder to write to");

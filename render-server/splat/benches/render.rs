@@ -1,15 +1,14 @@
-//! Milliseconds per RGB-D image (RGB, alpha, both depths), per instruction set, beside the plain
-//! reference; then where they go, pass by pass.
+//! Benchmark of the CPU renderer: milliseconds per RGB-D image (RGB, alpha, both depths) for each instruction set,
+//! compared with the reference; then the time of each pass.
 //!
 //! ```text
 //! cargo bench -p vizflyt-splat --bench render [-- [passes] [SCENE.ply]... [FILTER]]
 //! ```
 //!
-//! `passes` leaves out criterion's part, FILTER keeps the cases whose `scene/view` contains it.
-//! Scenes are synthetic (100 k and 1 M splats), the captured ones of a neighbouring `../shared`
-//! where present, and any PLY named on the command line (seen from the middle of its splats).
-//! Times are of the whole machine's cores, so compare figures of one run with each other; where
-//! others use the machine, the minimum of the per-pass table is the most meaningful.
+//! `passes` skips criterion's part, FILTER selects cases whose `scene/view` contains it. Scenes are synthetic (100 k
+//! and 1 M splats), the captured ones of a neighbouring `../shared`, if present, and any PLY file on the command line
+//! (seen from the centre of its splats). Times are for all cores of the machine, so compare only results of the same
+//! run. On a shared machine, the minimum of the per-pass table is the most meaningful value.
 
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
@@ -23,7 +22,7 @@ use vizflyt_splat::{
     Camera, CpuRenderer, PassTimes, Rasterizer, RgbdImage, Splats, ply, render_reference,
 };
 
-/// A scene and where it is seen from.
+/// Scene with its cameras.
 struct Case {
     name: String,
     splats: Splats,
@@ -32,7 +31,7 @@ struct Case {
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    // `cargo test` runs benches too, without this flag: nothing to test here.
+    // `cargo test` also runs benches, but without this flag; then nothing is measured.
     if !arguments.iter().any(|argument| argument == "--bench") {
         return;
     }
@@ -77,13 +76,13 @@ fn main() {
     }
 }
 
-/// Measured on the same kind of machine, two cores without a GPU; none of them gives depth.
+/// Measured on the same kind of machine, two cores without a GPU; none of these renderers outputs depth.
 const PEERS: &str = "peers, room p0 / p1, RGB only, median ms: 320x240: brush 662 / 601, web-splat \
     262 / 205 (a wrong picture), wgpu-3dgs-viewer 547 / 480 (a wrong picture); 640x480: brush 1344 / \
     1021, web-splat 402 / 315, wgpu-3dgs-viewer 830 / 764";
 
-/// Prints the median and least ms of every pass, how long each takes at least on this machine, and how many times faster the
-/// whole is than the reference.
+/// Prints the median and minimum time of every pass [ms], the minimum possible time of each on this machine, and the
+/// speedup of the whole over the reference.
 fn passes(case: &Case) {
     println!("\n{} ({} splats): median (least) ms of 60 images", case.name, case.splats.len());
     println!(
@@ -140,18 +139,17 @@ fn passes(case: &Case) {
     }
 }
 
-/// Surfels on a ground and on many trunks and crowns, by a small generator of random numbers:
-/// depth layers and sizes like a forest's.
+/// Returns random surfels on a ground and on many trunks and crowns, with depth layers and sizes like in a forest.
 fn synthetic(count: usize) -> Case {
     let mut state = 0x9e37_79b9_7f4a_7c15_u64;
     let mut random = move |low: f32, high: f32| {
-        // Knuth's MMIX generator; its upper 24 bits.
+        // Knuth's MMIX generator; uses its upper 24 bits.
         state =
             state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         low + (state >> 40) as f32 / (1u64 << 24) as f32 * (high - low)
     };
     let mut splats = Splats { sh_degree: 0, ..Splats::default() };
-    // So that more splats are smaller ones, of the same total area.
+    // More splats are smaller, with the same total area.
     let size = (100_000.0 / count as f32).sqrt();
     for i in 0..count {
         let (mean, scale) = if i % 3 == 0 {
@@ -180,7 +178,7 @@ fn synthetic(count: usize) -> Case {
         splats.opacities.push(random(0.3, 1.0));
         splats.sh.extend([(); 3].map(|()| random(-1.0, 1.0)));
     }
-    // From 1.2 m above the ground, along x.
+    // 1.2 m above the ground, looking along x.
     let ahead = DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X);
     let pose = Pose::new(DVec3::new(0.0, 0.0, 1.2), DQuat::from_mat3(&ahead));
     let cameras = sizes().map(|(w, h)| {
@@ -209,7 +207,7 @@ fn from_file(path: &Path) -> Case {
     Case { name, splats, cameras: cameras.into() }
 }
 
-/// The scenes of `../shared`, at the reference poses and both sizes.
+/// Returns the scenes of `../shared`, at the reference poses and both sizes.
 fn captured() -> Vec<Case> {
     #[derive(Deserialize)]
     struct File {

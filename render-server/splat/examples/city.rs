@@ -1,12 +1,13 @@
-//! A city of tens of millions of splats: made as a streamed scene, and flown through, packed.
+//! City of tens of millions of splats: generates it as a streamed scene, and flies through the packed scene.
 //!
 //! ```text
 //! cargo run --release -p vizflyt-splat --example city -- make FOLDER CHUNKS SPLATS_PER_CHUNK
 //! cargo run --release -p vizflyt-splat --example city -- fly PACKED MEMORY_MIB SECONDS
 //! ```
-//! Chunks are quarters of 3 by 3 blocks of houses and parks, beside one another. The camera flies along a street at 10 m/s, by
-//! the clock, 30 images a second or as many as the machine makes. Then every fifth of them is made once more with all that
-//! it needs, where that fits, and compared. `tests/bench/city` runs both, and says what each takes. Linux only: it reads /proc.
+//! Chunks are quarters of 3 by 3 blocks of houses and parks, next to each other. The camera flies along a street at
+//! 10 m/s in real time, at up to 30 images per second. Then every fifth image is rendered again with all blocks that
+//! it needs, if they fit, and compared. `tests/bench/city` runs both and prints the time of each. Linux only: it
+//! reads /proc.
 
 use std::error::Error;
 use std::path::Path;
@@ -28,9 +29,9 @@ const BLOCKS: usize = 3;
 const CHUNK_M: f32 = 40.0 * BLOCKS as f32;
 const SPEED_MPS: f64 = 10.0;
 const IMAGES_HZ: f64 = 30.0;
-/// Every so many images one is compared.
+/// Interval of compared images.
 const COMPARED: usize = 5;
-/// The flight begins with nothing in memory: figures without its first seconds stand beside those of all.
+/// Length of the start of the flight, with an empty pool. Results are printed with and without it. [s]
 const FIRST_S: f64 = 2.0;
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -73,7 +74,7 @@ fn make(folder: &Path, chunks: usize, splats: usize) -> Result<(), Box<dyn Error
     Ok(())
 }
 
-/// Returns the camera after some seconds: 8 m up in a street, looking along it, and from side to side.
+/// Returns the camera after some seconds: 8 m up in a street, looking along it and from side to side.
 fn camera(seconds: f64) -> Camera {
     let ahead = DQuat::from_mat3(&DMat3::from_cols(-DVec3::Y, -DVec3::Z, DVec3::X));
     let turn = DQuat::from_rotation_z(0.5 * (0.7 * seconds).sin()) * ahead;
@@ -81,15 +82,15 @@ fn camera(seconds: f64) -> Camera {
     Camera::new(Intrinsics::from_horizontal_fov(320, 240, 1.2), Pose::new(at_m, turn), 0.05)
 }
 
-/// An image of the flight.
+/// Image of the flight.
 struct Flown {
     at_s: f64,
     took_ms: f64,
     stand_ins: usize,
-    /// In memory, as a share of what fits.
+    /// Needed blocks as a share of those that fit.
     needed: f64,
     max_error_px: f32,
-    /// Of those that are compared.
+    /// Colours, for compared images only.
     rgb: Option<Vec<u8>>,
 }
 
@@ -147,7 +148,7 @@ fn rgb8(image: &RgbdImage) -> Vec<u8> {
     rgb
 }
 
-/// Prints figures of images.
+/// Prints the results of images.
 fn tell(which: &str, flown: &[Flown]) {
     let mut took_ms: Vec<f64> = flown.iter().map(|image| image.took_ms).collect();
     took_ms.sort_unstable_by(f64::total_cmp);
@@ -157,8 +158,8 @@ fn tell(which: &str, flown: &[Flown]) {
     };
     let greatest = |of: fn(&Flown) -> f64| flown.iter().map(of).fold(0.0, f64::max);
     println!(
-        "{which}: {} images, p50 {:.1} ms, p99 {:.1} ms, most {:.1} ms; in {:.1} % something stood in for what was not \
-         there (most {:.0} blocks); needed {:.0} % of the memory at most, allowed {:.2} px at most",
+        "{which}: {} images, p50 {:.1} ms, p99 {:.1} ms, most {:.1} ms; in {:.1} % with stand-ins for missing blocks \
+         (at most {:.0} blocks); needed at most {:.0} % of the memory, allowed error at most {:.2} px",
         flown.len(),
         at(0.5),
         at(0.99),
@@ -170,14 +171,14 @@ fn tell(which: &str, flown: &[Flown]) {
     );
 }
 
-/// Renders images again with all that they need, and prints how like them the flight's are.
+/// Renders images again with all needed blocks, and prints their similarity to those of the flight.
 fn compare(renderer: &mut CpuRenderer, flown: &[Flown]) {
     let (mut like_db, mut same) = (Vec::new(), 0);
     let mut images = [RgbdImage::default()];
     for image in flown {
         let Some(rgb) = &image.rgb else { continue };
         if let Err(why) = renderer.render(&[], &[camera(image.at_s)], &mut images) {
-            println!("at {:.1} s nothing to compare with: {why}", image.at_s);
+            println!("at {:.1} s cannot compare: {why}", image.at_s);
             continue;
         }
         let whole = rgb8(&images[0]);
@@ -190,16 +191,16 @@ fn compare(renderer: &mut CpuRenderer, flown: &[Flown]) {
         }
     }
     like_db.sort_unstable_by(f64::total_cmp);
-    println!("compared with whole images: {same} the same, {} differ", like_db.len());
+    println!("compared with complete images: {same} identical, {} differ", like_db.len());
     if let [least_db, ..] = like_db[..] {
         println!(
-            "of those PSNR: least {least_db:.1} dB, median {:.1} dB",
+            "PSNR of the latter: minimum {least_db:.1} dB, median {:.1} dB",
             like_db[like_db.len() / 2]
         );
     }
 }
 
-/// Returns the greatest resident size so far.
+/// Returns the maximum resident size. [MB]
 fn peak_mb() -> Result<u64, Box<dyn Error>> {
     let status = std::fs::read_to_string("/proc/self/status")?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).ok_or("no VmHWM")?;

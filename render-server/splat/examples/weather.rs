@@ -1,10 +1,10 @@
-//! What weather costs: processor time of each effect over that of a clear image, on one thread, so that what else
-//! the machine does counts little. Linux only: it reads /proc.
+//! Measures the cost of weather: processor time of each effect compared with that of a clear image, on one thread, so
+//! that other load on the machine has little influence. Linux only: it reads /proc.
 //!
 //! ```text
 //! cargo run --release -p vizflyt-splat --example weather -- SCENE.ply X Y Z YAW_DEG WIDTH
 //! ```
-//! The camera stands at X Y Z, looks along x turned by YAW_DEG about z, 90 degrees wide.
+//! The camera is at X Y Z, looks along x rotated by YAW_DEG about z, and has a field of view of 90 degrees.
 
 use glam::{DMat3, DQuat, DVec3, Vec2, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
@@ -86,7 +86,7 @@ fn effects() -> [(&'static str, Weather); 9] {
     ]
 }
 
-/// Returns what all threads have had of the processor so far (proc(5), schedstat). [ms]
+/// Returns the total processor time of all threads (proc(5), schedstat). [ms]
 fn processor_ms() -> Result<f64, Box<dyn std::error::Error>> {
     let mut total_ns = 0;
     for thread in std::fs::read_dir("/proc/self/task")? {

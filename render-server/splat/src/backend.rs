@@ -1,4 +1,4 @@
-//! Which renderer a machine gets, and why: asked once at start, printed, shown on the page.
+//! Choice of the renderer for a machine, with the reason. Made once at the start, printed and shown on the page.
 
 use std::str::FromStr;
 
@@ -6,16 +6,16 @@ use std::str::FromStr;
 use crate::gpu;
 use crate::{CpuRenderer, Detail, FallbackRenderer, Rasterizer, Scene};
 
-/// What the user asked for.
+/// Requested kind of renderer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Backend {
-    /// A graphics card if one answers and renders a test image as the processor does, else the
-    /// processor. Software Vulkan is left alone.
+    /// Graphics card if one is available and renders a test image as the processor does, else the processor. Software
+    /// Vulkan is skipped.
     #[default]
     Auto,
-    /// The processor.
+    /// Processor.
     Cpu,
-    /// Any graphics adapter, software Vulkan too.
+    /// Any graphics adapter, including software Vulkan.
     Gpu,
 }
 
@@ -32,16 +32,16 @@ impl FromStr for Backend {
     }
 }
 
-/// The name is no backend's.
+/// Unknown name of a backend.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no renderer {0:?}; choose auto, cpu or gpu")]
+#[error("unknown renderer {0:?}; choose auto, cpu or gpu")]
 pub struct UnknownBackend(String);
 
-/// A renderer, and why it is this one.
+/// Chosen renderer with the reason.
 pub struct Chosen {
-    /// Holds its own packed copy of the scene.
+    /// Renderer with its own packed copy of the scene.
     pub rasterizer: Box<dyn Rasterizer>,
-    /// In words: `no graphics adapter`.
+    /// Reason of the choice, as text: `no graphics adapter`.
     pub reason: String,
 }
 
@@ -51,20 +51,19 @@ impl std::fmt::Debug for Chosen {
     }
 }
 
-/// No renderer does what was asked.
+/// The requested renderer is not available.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NoRenderer {
-    /// The GPU was asked for and none can be used.
+    /// The GPU was requested, but no adapter can be used.
     #[error("no graphics adapter can be used: {0}; choose cpu or auto")]
     Gpu(String),
 }
 
-/// Returns the renderer for a scene on this machine. One on a graphics card has the processor
-/// behind it ([`crate::FallbackRenderer`]), in the same detail: no image is missing when its device is lost.
+/// Returns the renderer for a scene on this machine. A renderer on a graphics card gets the processor as fallback
+/// ([`crate::FallbackRenderer`]) in the same detail, so that no image is missing if the device is lost.
 ///
 /// # Errors
-/// [`NoRenderer::Gpu`] if [`Backend::Gpu`] was asked for and there is none; the others always
-/// find one.
+/// [`NoRenderer::Gpu`] if [`Backend::Gpu`] was requested and no adapter can be used. The other backends never fail.
 pub fn choose<'a>(
     scene: impl Into<Scene<'a>>,
     backend: Backend,
@@ -83,8 +82,8 @@ pub fn choose<'a>(
     }
 }
 
-/// Returns a renderer on the first adapter that renders the test image, and what was found; or why
-/// there is none.
+/// Returns a renderer on the first adapter that renders the test image, and a description of all adapters tried; or
+/// why no adapter can be used.
 #[cfg(feature = "gpu")]
 fn graphics(
     packed: &CpuRenderer,
@@ -123,7 +122,7 @@ fn graphics(_: &CpuRenderer, _: bool) -> Result<(Box<dyn Rasterizer>, String), S
     Err("built without the feature `gpu`".to_owned())
 }
 
-/// The test image: drivers have been seen to sort wrongly, and to render nothing.
+/// Test image: some drivers sort incorrectly or render nothing.
 #[cfg(feature = "gpu")]
 mod trial {
     use glam::{Quat, Vec3};
@@ -131,15 +130,15 @@ mod trial {
 
     use crate::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
-    /// Less is no rounding: right renderers differ by 75 dB and more.
+    /// Minimum similarity; a lower value is not a rounding error. Correct renderers agree to 75 dB and more.
     const MIN_DB: f64 = 50.0;
 
-    /// Returns 20 k splats in many layers, more than one group of the sort holds, and a camera that
-    /// sees most of them.
+    /// Returns 20 k splats in many layers, more than one group of the sort holds, and a camera that sees most of
+    /// them.
     pub(super) fn scene_and_camera() -> (Splats, Camera) {
         let mut splats = Splats { sh_degree: 1, ..Splats::default() };
         for i in 0..20_000u32 {
-            // Low-discrepancy numbers (Roberts 2018, R3): evenly spread and without a pattern.
+            // Low-discrepancy numbers (Roberts 2018, R3): evenly spread, without a pattern.
             let r = |share: f64, i: u32| (0.5 + share * f64::from(i)).fract() as f32;
             let (x, y, z) = (r(0.819_172_5, i), r(0.671_043_6, i), r(0.549_700_5, i));
             splats.means_m.push(Vec3::new(x * 4.0 - 2.0, y * 3.0 - 1.5, 1.0 + 3.0 * z));
@@ -156,7 +155,7 @@ mod trial {
         (splats, camera)
     }
 
-    /// Renders the test image twice, and returns how like the processor's it is; or what is wrong.
+    /// Renders the test image twice, and returns its similarity to the processor's image [dB]; or the error.
     pub(super) fn check(
         renderer: &mut dyn Rasterizer,
         splats: &Splats,
@@ -173,7 +172,7 @@ mod trial {
             return Err("renders the same test image differently each time".to_owned());
         }
         let found_db = alike_db(&images[0], &expected[0]);
-        // Positive, so that NaN is refused.
+        // Written so that NaN is rejected.
         if found_db >= MIN_DB {
             Ok(found_db)
         } else {
@@ -181,8 +180,8 @@ mod trial {
         }
     }
 
-    /// Returns the least peak signal-to-noise ratio of colour, alpha and expected depth; depth
-    /// relative to 4 m. [dB]
+    /// Returns the minimum peak signal-to-noise ratio of colour, alpha and expected depth; depth relative to 4 m.
+    /// [dB]
     fn alike_db(a: &RgbdImage, b: &RgbdImage) -> f64 {
         let db = |a: &[f32], b: &[f32], peak: f64| {
             let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
@@ -203,7 +202,7 @@ mod trial {
         use super::*;
         use crate::{PassTimes, Placement, RenderError, Workload};
 
-        /// Renders as the processor, then spoils.
+        /// Renders like the processor, then corrupts the image.
         struct Spoiling(CpuRenderer, fn(&mut RgbdImage, usize), usize);
 
         impl Rasterizer for Spoiling {
@@ -229,7 +228,7 @@ mod trial {
         }
 
         #[test]
-        fn only_a_right_image_passes() {
+        fn rejects_wrong_and_unstable_images() {
             let (splats, camera) = scene_and_camera();
             let check = |spoil: fn(&mut RgbdImage, usize), part: &str| {
                 let mut renderer = Spoiling(CpuRenderer::new(&splats), spoil, 0);

@@ -1,8 +1,7 @@
-//! What all renderers pack a scene into: which splats can be seen at all, in which order, in blocks
-//! with which bounds.
+//! Packing shared by all renderers: removes invisible splats, orders the rest, and computes the bounds of each block.
 //!
-//! Splats stand in Morton order, so that [`BLOCK`] neighbours in memory are neighbours in space: a
-//! block is culled as one.
+//! Splats are in Morton order, so that [`BLOCK`] consecutive splats are neighbours in space and are culled as one
+//! block.
 
 use glam::{Mat3, Vec3};
 use rayon::prelude::*;
@@ -10,22 +9,23 @@ use rayon::prelude::*;
 use crate::Splats;
 use crate::limits::{ALPHA_MIN, MAX_SCALE_M};
 
-/// Splats per block: bounds cost some 28 bytes, 256 depths sort from one cache line to the next,
-/// and a workgroup of any graphics card takes one splat a thread.
+/// Splats per block. Bounds cost about 28 bytes, 256 depths sort within few cache lines, and a workgroup of any
+/// graphics card processes one splat per thread.
 pub(crate) const BLOCK: usize = 256;
 
-/// Where the splats of a block are, and how far they reach.
+/// Position and extent of the splats of a block.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Bounds {
-    /// Middle of the box around the centres. [m, part]
+    /// Centre of the box around the splats' centres. [m, part]
     pub(crate) center_m: Vec3,
-    /// Half the sides of that box. [m]
+    /// Half side lengths of that box. [m]
     pub(crate) half_m: Vec3,
-    /// The greatest distance from its centre at which a splat of the block still counts. [m]
+    /// Maximum distance from its centre at which a splat of the block is visible. [m]
     pub(crate) reach_m: f32,
 }
 
-/// Returns the indices of the splats that can be seen at all, along a Morton curve.
+/// Returns the indices of all visible splats along a Morton curve. Omits splats with opacity below 1/255 and invalid
+/// numbers.
 pub(crate) fn order(splats: &Splats) -> Vec<u32> {
     let numbers = splats.sh_coefficients() * 3;
     let visible = |&i: &u32| {
@@ -45,7 +45,7 @@ pub(crate) fn order(splats: &Splats) -> Vec<u32> {
         let mean = splats.means_m[i as usize];
         (low.min(mean), high.max(mean))
     });
-    // One scale for all axes keeps blocks roundish.
+    // The same scale for all axes keeps blocks compact.
     let side = (high - low).max_element().max(f32::MIN_POSITIVE);
     let mut keyed: Vec<(u64, u32)> = kept
         .par_iter()
@@ -59,7 +59,7 @@ pub(crate) fn order(splats: &Splats) -> Vec<u32> {
     keyed.into_iter().map(|(_, i)| i).collect()
 }
 
-/// Spreads 21 bits so that two zeros follow each.
+/// Spreads 21 bits so that two zeros follow each bit.
 fn spread(v: u64) -> u64 {
     let v = v & 0x1f_ffff;
     let v = (v | v << 32) & 0x001f_0000_0000_ffff;
@@ -87,7 +87,7 @@ pub(crate) fn bounds(splats: &Splats, order: &[u32]) -> Bounds {
         let largest_m = splats.scales_m[i].max_element().min(MAX_SCALE_M);
         reach_m = reach_m.max(deviations * largest_m);
     }
-    // Halved before they are added: no sum overflows. Widened by their own rounding.
+    // Halved before the addition, so that the sum cannot overflow. Widened by the rounding error.
     let center_m = low * 0.5 + high * 0.5;
     let half_m = (high * 0.5 - low * 0.5) + center_m.abs() * 1e-6;
     Bounds { center_m, half_m, reach_m: reach_m * 1.0001 }

@@ -1,25 +1,24 @@
-//! Splats of things that no one has scanned: boxes with plain colours, and a quadrotor made of them.
+//! Splats of generated models: boxes with plain colours, and a quadrotor made of them.
 //!
-//! A vehicle in the room is seen by the others as this quadrotor, and a generated scene may have one
-//! fly in it. Made once, some thousand splats.
+//! Other vehicles in the room are rendered as this quadrotor, and a generated scene can contain one. Created once;
+//! some thousand splats.
 
 use glam::{Mat3, Quat, Vec3};
 
 use crate::Splats;
 
-/// A box of a model.
+/// Box of a model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Part {
-    /// Its middle. [m, object]
+    /// Centre. [m, object]
     pub center_m: Vec3,
-    /// Half of each side. [m, object]
+    /// Half side lengths. [m, object]
     pub half_m: Vec3,
-    /// Colour as displayed, 0 to 1.
+    /// Displayed colour, 0 to 1.
     pub colour: [f32; 3],
 }
 
-/// A quadrotor of 0.22 m across, as a body of 0.12 m radius holds it: x ahead, y left, z up, its nose
-/// orange.
+/// Quadrotor of 0.22 m across, which fits a body of 0.12 m radius: x forward, y left, z up, with an orange nose.
 pub const QUADROTOR: [Part; 8] = [
     part([0.0, 0.0, 0.0], [0.045, 0.03, 0.022], GREY),
     part([0.05, 0.0, 0.0], [0.008, 0.022, 0.016], ORANGE),
@@ -39,13 +38,13 @@ const fn part(center_m: [f32; 3], half_m: [f32; 3], colour: [f32; 3]) -> Part {
     Part { center_m: Vec3::from_array(center_m), half_m: Vec3::from_array(half_m), colour }
 }
 
-/// Returns the splats of boxes, in their own frame: flat ones on every face, brighter above than
-/// below, so that edges are seen without any light. [m, object]
+/// Returns the splats of boxes in the boxes' frame: flat splats on every face, brighter at the top than at the
+/// bottom, so that edges are visible without lighting. [m, object]
 pub fn boxes(parts: &[Part]) -> Splats {
     boxes_in_patches(parts, PATCH_M)
 }
 
-/// As [`boxes`], in patches of this side at most: what is plain and large needs few. [m]
+/// Same as [`boxes`], with patches of at most this side length. Large plain boxes need few patches. [m]
 pub fn boxes_in_patches(parts: &[Part], patch_m: f32) -> Splats {
     let mut splats = Splats::default();
     for part in parts {
@@ -85,11 +84,11 @@ fn face(splats: &mut Splats, part: &Part, patch_m: f32, axis: usize, side: f32) 
     }
 }
 
-/// Greatest side of a patch: finer than a pixel of 320 at half a metre. [m]
+/// Maximum side of a patch: smaller than a pixel of an image 320 px wide at half a metre. [m]
 const PATCH_M: f32 = 0.012;
-/// Neighbours overlap enough to be opaque.
+/// Standard deviation as a share of the patch's side: neighbours overlap enough to be opaque.
 const OVERLAP: f32 = 0.55;
-/// Patches lie this far inside: their thickness. [m]
+/// Depth of the patches below the surface: their thickness. [m]
 const SINK_M: f32 = 0.001;
 /// The constant harmonic, 1 / (2 sqrt(pi)).
 const SH_CONSTANT: f32 = 0.282_094_8;
@@ -99,7 +98,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_quadrotor_is_within_its_body_and_well_formed() {
+    fn quadrotor_fits_its_body_and_is_well_formed() {
         let splats = boxes(&QUADROTOR);
         let Splats { means_m, scales_m, rotations, opacities, sh_degree, sh, antialiased: _ } =
             &splats;

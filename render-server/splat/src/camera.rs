@@ -1,4 +1,4 @@
-//! A camera placed in the world.
+//! Camera with a pose in the world.
 
 use glam::DVec2;
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, InvalidIntrinsics, Pose, World};
@@ -6,23 +6,23 @@ use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, InvalidIntrinsics,
 use crate::Atmosphere;
 use crate::limits::JACOBIAN_MARGIN;
 
-/// What is rendered, from where.
+/// Camera: intrinsics, pose, near plane, background and air.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
-    /// Size, focal lengths, principal point, lens.
+    /// Image size, focal lengths, principal point, lens distortion.
     pub intrinsics: Intrinsics,
-    /// Where the camera is.
+    /// Pose of the camera.
     pub world_from_cam: Pose<World, Cam>,
-    /// Splats nearer than this are not rendered. [m]
+    /// Distance of the near plane; closer splats are not rendered. [m]
     pub near_m: f32,
-    /// Linear RGB shown where nothing covers the pixel, in clear air and plain light.
+    /// Linear RGB of pixels without splats, in clear air and unchanged light.
     pub background: [f32; 3],
-    /// What lies between the scene and the camera.
+    /// Light on the scene, and the air between scene and camera.
     pub atmosphere: Atmosphere,
 }
 
 impl Camera {
-    /// Returns a camera that shows black where nothing covers the pixel, through clear air.
+    /// Returns a camera with black background and clear air.
     pub const fn new(
         intrinsics: Intrinsics,
         world_from_cam: Pose<World, Cam>,
@@ -32,7 +32,7 @@ impl Camera {
         Self { intrinsics, world_from_cam, near_m, background: [0.0; 3], atmosphere }
     }
 
-    /// Checks that every number is one a renderer can work with.
+    /// Checks that all values are in the range that renderers support.
     pub fn validate(&self) -> Result<(), InvalidCamera> {
         self.intrinsics.validate()?;
         let far_away = self.world_from_cam.translation_m.abs().max_element() > MAX_DISTANCE_M;
@@ -48,13 +48,13 @@ impl Camera {
         self.atmosphere.validate()
     }
 
-    /// Returns least and greatest `(x / z, y / z)` at which a splat is linearised.
+    /// Returns minimum and maximum `(x / z, y / z)` at which a splat is linearised.
     ///
-    /// Where a pinhole, or a lens near to one, puts what is far outside the image, the linearisation
-    /// blows up: it is taken within what the image shows, and [`JACOBIAN_MARGIN`] of half its size
-    /// on every side. A fisheye's does not blow up, since the lens pulls together what the slope
-    /// spreads; and all it can image lies close to the image: taken anywhere but at the splat
-    /// itself, splats at 80 degrees would swell over all of a narrower image.
+    /// For a pinhole, or a lens close to one, the linearisation diverges far outside the image. It is therefore taken
+    /// at a slope within the image, widened by [`JACOBIAN_MARGIN`] of half its size on every side. For a fisheye it
+    /// does not diverge, because the lens compresses large slopes, and everything that it can image is close to the
+    /// image. There, the linearisation is taken at the splat itself: taken elsewhere, splats at 80 degrees would
+    /// cover all of a narrower image.
     pub(crate) fn slope_bounds(&self) -> [DVec2; 2] {
         let k = &self.intrinsics;
         let size = DVec2::new(f64::from(k.width_px), f64::from(k.height_px));
@@ -73,7 +73,7 @@ impl Camera {
                 show((size - centre) / focal);
             }
             Distortion::BrownConrady { .. } => {
-                // The lens bends the border; past its reach the reach itself is the border.
+                // The lens bends the border of the image. Beyond its reach, the reach is the border.
                 for i in 0..=BORDER_POINTS {
                     let t = f64::from(i) / f64::from(BORDER_POINTS);
                     for at in [
@@ -99,30 +99,30 @@ impl Camera {
     }
 }
 
-/// Why a camera is refused.
+/// Why a camera is invalid.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum InvalidCamera {
-    /// The intrinsics are.
+    /// Invalid intrinsics.
     #[error(transparent)]
     Intrinsics(#[from] InvalidIntrinsics),
-    /// The pose is not finite, not a rotation, or further than 1e7 m from the origin.
-    #[error("camera pose {0} is no rotation and finite position within 1e7 m")]
+    /// Pose is not finite, not a rotation, or further than 1e7 m from the origin.
+    #[error("camera pose {0} is not a rotation and a finite position within 1e7 m")]
     Pose(String),
-    /// The near plane is not a sensible distance.
+    /// Near plane is out of range.
     #[error("near plane at {0} m is outside 0.0001 to 1e6 m")]
     Near(f32),
-    /// The background is not finite.
+    /// Background is not finite.
     #[error("background {0:?} is not finite")]
     Background([f32; 3]),
-    /// Light or fog is not.
+    /// Light or fog is out of range.
     #[error("{0:?}: light and fog are finite and at least 0, at most 100")]
     Atmosphere(Atmosphere),
 }
 
-/// Points on each side of the image at which a lens's border is found.
+/// Points on each side of the image that sample the border behind a lens.
 const BORDER_POINTS: u32 = 32;
-/// f32 resolves 1 m there. [m]
+/// At this distance, f32 resolves 1 m. [m]
 const MAX_DISTANCE_M: f64 = 1e7;
-/// Closer, the squares of the projection leave f32. [m]
+/// Minimum near plane. For smaller values, the squares of the projection exceed f32. [m]
 const MIN_NEAR_M: f32 = 1e-4;
 const MAX_NEAR_M: f32 = 1e6;

@@ -1,9 +1,8 @@
-//! A renderer that outlives its device: the image under way when a driver resets is rendered by the
-//! processor, and so are all after it.
+//! Renderer that continues on the processor if its device is lost, for example by a driver reset. The current image
+//! and all later images are then rendered by the processor.
 //!
-//! Cost: the processor's packed copy of the scene is there from the start, 52 bytes per splat and 6
-//! to 96 for its harmonics (0.74 GB for 5 M of degree 3), because packing takes seconds when the
-//! vehicle has none.
+//! Cost: a second packed copy of the scene from the start, 52 bytes per splat and 6 to 96 for its harmonics (0.74 GB
+//! for 5 M splats of degree 3). Packing takes seconds, too long during a flight.
 
 use std::borrow::Cow;
 
@@ -11,24 +10,24 @@ use crate::{
     Camera, CpuRenderer, PassTimes, Placement, Rasterizer, RenderError, RgbdImage, Workload,
 };
 
-/// A renderer on a device, and the processor behind it.
+/// Renderer on a device, with the processor as fallback.
 pub struct FallbackRenderer {
     active: Box<dyn Rasterizer>,
-    /// Until it is needed.
+    /// Fallback until it is needed.
     spare: Option<CpuRenderer>,
-    /// What renders now, and what was lost and why.
+    /// Name after the fallback: active renderer, lost renderer and reason.
     renamed: Option<String>,
 }
 
 impl FallbackRenderer {
-    /// Puts a processor's renderer of the same scene behind `first`.
+    /// Adds the fallback `spare`, a CPU renderer of the same scene, to `first`.
     pub fn new(first: Box<dyn Rasterizer>, spare: CpuRenderer) -> Self {
         Self { active: first, spare: Some(spare), renamed: None }
     }
 }
 
 impl Rasterizer for FallbackRenderer {
-    /// Returns what renders now, and what was lost: `cpu avx2, for gpu X is lost: ...`.
+    /// Returns the active renderer, and after a fallback also the lost one: `cpu avx2, for gpu X is lost: ...`.
     fn name(&self) -> Cow<'_, str> {
         self.renamed.as_deref().map_or_else(|| self.active.name(), Cow::Borrowed)
     }
@@ -65,7 +64,7 @@ mod tests {
     use super::*;
     use crate::Splats;
 
-    /// Renders `left` images through another renderer, then its device is gone.
+    /// Renders `left` images through another renderer, then fails as a lost device.
     struct Failing {
         inner: CpuRenderer,
         left: usize,
@@ -125,7 +124,7 @@ mod tests {
         assert!(fallback.name().starts_with("cpu "), "{}", fallback.name());
         assert!(fallback.name().ends_with("for gpu of glass is lost: it broke"));
         assert_eq!(fallback.workload().splats, 1);
-        // What is no device's fault stays an error.
+        // An error that is not the device's stays an error.
         let bad = Camera { near_m: f32::NAN, ..camera };
         let refused = fallback.render(&[], &[bad], &mut [RgbdImage::default()]);
         assert!(matches!(refused, Err(RenderError::Camera(_))));

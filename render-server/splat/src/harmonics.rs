@@ -1,7 +1,7 @@
-//! Real spherical harmonics to degree 3: colour by direction of view, in plain f64.
+//! Real spherical harmonics up to degree 3: colour by viewing direction, in f64.
 //!
-//! Constants and signs as in the 3DGS trainers (from Sloan, "Efficient Spherical Harmonic
-//! Evaluation", JCGT 2013, with the Condon-Shortley phase).
+//! Constants and signs are those of the 3DGS trainers (from Sloan, "Efficient Spherical Harmonic Evaluation", JCGT
+//! 2013, with the Condon-Shortley phase).
 
 use glam::{DQuat, DVec3};
 
@@ -9,7 +9,7 @@ use glam::{DQuat, DVec3};
 pub const C0: f64 = 0.28209479177387814;
 /// `sqrt(3 / (4 pi))`.
 pub const C1: f64 = 0.4886025119029199;
-/// Degree 2.
+/// Constants of degree 2.
 pub const C2: [f64; 5] = [
     1.0925484305920792,
     -1.0925484305920792,
@@ -17,7 +17,7 @@ pub const C2: [f64; 5] = [
     -1.0925484305920792,
     0.5462742152960396,
 ];
-/// Degree 3.
+/// Constants of degree 3.
 pub const C3: [f64; 7] = [
     -0.5900435899266435,
     2.890611442640554,
@@ -28,8 +28,8 @@ pub const C3: [f64; 7] = [
     -0.5900435899266435,
 ];
 
-/// Returns the linear RGB of harmonics (coefficient by coefficient, RGB within) seen along a unit
-/// direction from the camera to the splat; not below 0.
+/// Returns the linear RGB of harmonics (coefficient by coefficient, in each RGB), seen along a unit direction from
+/// the camera to the splat; clamped to at least 0.
 pub fn colour(sh: &[f32], direction: [f64; 3]) -> [f64; 3] {
     let basis = basis(direction);
     let mut rgb = [0.5; 3];
@@ -64,15 +64,15 @@ pub fn basis([x, y, z]: [f64; 3]) -> [f64; 16] {
     ]
 }
 
-/// A rotation of harmonics: those of a degree mix only among themselves, by a matrix per degree.
+/// Rotation of harmonics. Coefficients mix only within their degree, by one matrix per degree.
 #[derive(Clone, Debug)]
 pub struct Turn {
-    /// Of degree 1 and on; none where nothing turns.
+    /// Matrices from degree 1 on; empty if the rotation is the identity.
     mixes: Vec<[[f32; 7]; 7]>,
 }
 
 impl Turn {
-    /// Returns what a rotation does to harmonics up to a degree.
+    /// Returns the rotation of harmonics up to a degree.
     pub fn new(rotation: DQuat, degree: u8) -> Self {
         if rotation.w.abs() > 1.0 - 1e-15 {
             return Self { mixes: Vec::new() };
@@ -80,7 +80,7 @@ impl Turn {
         Self { mixes: (1..=usize::from(degree)).map(|band| mixing(band, rotation)).collect() }
     }
 
-    /// Turns the harmonics of one splat; coefficient by coefficient, RGB within.
+    /// Rotates the harmonics of one splat; coefficient by coefficient, in each RGB.
     pub fn apply(&self, sh: &mut [f32]) {
         for (mix, band) in self.mixes.iter().zip(1..) {
             let width = 2 * band + 1;
@@ -96,9 +96,9 @@ impl Turn {
     }
 }
 
-/// Returns M with `after = M before` for degree `band`: `M_ij` is the integral of `Y_i(R d) Y_j(d)` over all directions,
-/// because the basis is orthonormal. By a quadrature that is exact for polynomials of degree 7: Gauss and Legendre's along
-/// z, even steps around it.
+/// Returns M with `after = M before` for degree `band`. `M_ij` is the integral of `Y_i(R d) Y_j(d)` over all
+/// directions, because the basis is orthonormal. Computed by a quadrature that is exact for polynomials of degree 7:
+/// Gauss-Legendre along z, equal steps around z.
 fn mixing(band: usize, rotation: DQuat) -> [[f32; 7]; 7] {
     const NODES: [(f64, f64); 2] = [
         (0.339_981_043_584_856_3, 0.652_145_154_862_546_1),
@@ -129,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn turned_harmonics_show_in_turned_directions_what_they_showed() {
+    fn rotation_keeps_colours_in_rotated_directions() {
         let rotation = DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize();
         let sh: Vec<f32> = (0..48).map(|k| (k as f32 * 1.7).sin() * 0.3).collect();
         let mut turned = sh.clone();

@@ -1,15 +1,15 @@
-//! What a renderer writes, and its integer forms for encoders.
+//! Output of a renderer, and conversion to integers for encoders.
 
 use core::ops::Range;
 
-/// Colour, depth, alpha and object ids of one camera; row-major, reused from image to image.
+/// Colour, depth, alpha and object ids of one camera; row-major. Buffers are reused for the next image.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RgbdImage {
     /// Width. [px]
     pub width_px: u32,
     /// Height. [px]
     pub height_px: u32,
-    /// H x W x 3, on the background, unclamped.
+    /// H x W x 3 colour, blended onto the background, unclamped.
     pub rgb: Vec<f32>,
     /// H x W accumulated opacity, 0 to 1.
     pub alpha: Vec<f32>,
@@ -18,28 +18,27 @@ pub struct RgbdImage {
     /// H x W median camera-z depth: z of the splat at which transmittance falls to one half; 0
     /// where it never does. [m, cam]
     pub depth_median_m: Vec<f32>,
-    /// H x W [`crate::RigidObject::id`] of what the median depth is of; 0 for what stands still,
-    /// and where the median depth is 0.
+    /// H x W [`crate::RigidObject::id`] of the splat that gives the median depth; 0 for the static part, and where
+    /// the median depth is 0.
     pub ids: Vec<u16>,
 }
 
-/// Which of the two depths of an image.
+/// Kind of depth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum DepthKind {
-    /// Where transmittance falls to one half: sharp at edges, never between two surfaces.
+    /// Depth at which transmittance falls to one half: sharp at edges, never between two surfaces.
     #[default]
     Median,
-    /// The mean over everything the pixel sees: smooth, between the surfaces at edges.
+    /// Mean over all splats of the pixel: smooth, but between the surfaces at edges.
     Expected,
 }
 
 impl RgbdImage {
-    /// Alpha from which an expected depth counts as a return: below, more than half of the light
-    /// comes from the background, and the median is "no return" too.
+    /// Minimum alpha of a valid expected depth. Below it, more than half of the light comes from the background, and
+    /// the median is also "no return".
     pub const MIN_DEPTH_ALPHA: f32 = 0.5;
 
-    /// Gives every buffer the length of a `width_px` x `height_px` image. Contents are
-    /// unspecified; allocates only when the image grows.
+    /// Resizes every buffer to `width_px` x `height_px`. Contents are unspecified. Allocates only if the image grows.
     pub fn resize(&mut self, width_px: u32, height_px: u32) {
         let pixels = width_px as usize * height_px as usize;
         self.width_px = width_px;
@@ -51,13 +50,13 @@ impl RgbdImage {
         self.ids.resize(pixels, 0);
     }
 
-    /// Writes H x W x 3 bytes of RGB, clamped and rounded, to `out`, whose length and contents are
-    /// replaced. Splats are trained on sRGB values, so these *are* sRGB values: no gamma is applied.
+    /// Writes H x W x 3 bytes of RGB, clamped and rounded, to `out`, which is resized and overwritten. No gamma is
+    /// applied: splats are trained on sRGB values, so these values are already sRGB.
     pub fn write_rgb8(&self, out: &mut Vec<u8>) {
         quantise_rgb(&self.rgb, out);
     }
 
-    /// As [`Self::write_rgb8`], of some rows only.
+    /// Same as [`Self::write_rgb8`], for some rows.
     ///
     /// # Panics
     /// If the image does not have these rows.
@@ -66,14 +65,13 @@ impl RgbdImage {
         quantise_rgb(&self.rgb[3 * pixels.start..3 * pixels.end], out);
     }
 
-    /// Writes H x W depths in whole millimetres to `out`, whose length and contents are replaced:
-    /// 0 where there is no return, that is where alpha is below [`Self::MIN_DEPTH_ALPHA`], where
-    /// nothing was hit, or beyond 65.535 m, as REP 118 has it. [mm, cam]
+    /// Writes H x W depths in whole millimetres to `out`, which is resized and overwritten. 0 means no return (as in
+    /// REP 118): alpha below [`Self::MIN_DEPTH_ALPHA`], no hit, or more than 65.535 m. [mm, cam]
     pub fn write_depth_mm(&self, kind: DepthKind, out: &mut Vec<u16>) {
         quantise_depth(self.depth_m(kind), &self.alpha, out);
     }
 
-    /// As [`Self::write_depth_mm`], of some rows only.
+    /// Same as [`Self::write_depth_mm`], for some rows.
     ///
     /// # Panics
     /// If the image does not have these rows.
@@ -98,7 +96,7 @@ impl RgbdImage {
 fn quantise_rgb(rgb: &[f32], out: &mut Vec<u8>) {
     out.resize(rgb.len(), 0);
     for (byte, &value) in out.iter_mut().zip(rgb) {
-        // Clamped before the cast, in an order that vectorises; NaN becomes 0.
+        // Clamped before the cast, in an order that the compiler vectorises; NaN becomes 0.
         *byte = (value.max(0.0) * 255.0 + 0.5).min(255.0) as u8;
     }
 }
@@ -128,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn depth_is_millimetres_or_no_return() {
+    fn depth_is_in_millimetres_or_no_return() {
         let image = RgbdImage {
             alpha: vec![1.0, 0.49, 0.5, 1.0, 1.0, 1.0, 1.0],
             depth_median_m: vec![1.2344, 2.0, 2.0006, 65.535, 65.5356, f32::NAN, 0.0],
@@ -143,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_are_cut_from_the_whole() {
+    fn writes_rows_as_in_the_whole_image() {
         let mut image = RgbdImage::default();
         image.resize(5, 4);
         for (n, value) in image.rgb.iter_mut().enumerate() {

@@ -1,9 +1,8 @@
-//! (scene, cameras) -> RGB, metric depth, alpha and object ids of 3D Gaussian splats.
+//! Renders 3D Gaussian splats: (scene, cameras) -> RGB, metric depth, alpha and object ids.
 //!
-//! A twin comes from a file ([`format`]) as [`Splats`]; with the objects that move in it, it is a
-//! [`Scene`]. A [`Rasterizer`] takes the scene once and then renders any number of [`Camera`]s per
-//! call into [`RgbdImage`]s that the caller keeps. [`render_reference`] is the plain truth every
-//! fast renderer is compared with.
+//! [`format`] reads a twin from a file as [`Splats`]. With its moving objects it is a [`Scene`]. A [`Rasterizer`]
+//! packs the scene once and then renders any number of [`Camera`]s per call into [`RgbdImage`]s that the caller
+//! keeps. [`render_reference`] is the simple, slow renderer with which all fast renderers are compared.
 //!
 //! ```
 //! use glam::{Quat, Vec3};
@@ -30,7 +29,7 @@
 //! # Ok::<(), vizflyt_splat::RenderError>(())
 //! ```
 //!
-//! No network, no tokio, no clock but the stopwatch of [`PassTimes`]: a function of its arguments.
+//! Results depend only on the arguments: the crate uses no network, no tokio, and no clock except for [`PassTimes`].
 
 #![warn(missing_docs)]
 

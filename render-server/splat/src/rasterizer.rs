@@ -1,22 +1,23 @@
-//! The one contract of all renderers: (scene, placements of its objects, cameras) -> images.
+//! Interface of all renderers: (scene, placements of its objects, cameras) -> images.
 
 use std::borrow::Cow;
 
 use crate::{Camera, InvalidCamera, Placement, RgbdImage};
 
-/// Renders a scene that it holds a packed copy of.
+/// Renderer with its own packed copy of a scene.
 pub trait Rasterizer: Send {
-    /// Returns what it runs on, for reports: `cpu avx2`, `gpu NVIDIA GeForce RTX 3080 (Vulkan)`.
+    /// Returns the device's name for reports: `cpu avx2`, `gpu NVIDIA GeForce RTX 3080 (Vulkan)`.
     fn name(&self) -> Cow<'_, str>;
 
-    /// Renders one image per camera, resizing each, and returns how long the passes took.
-    /// `placements` has one entry per object of the scene.
+    /// Renders one image per camera, resizes each image, and returns the time of each pass. `placements` has one
+    /// entry per object of the scene.
     ///
     /// # Errors
-    /// [`RenderError`]; images are unspecified then, and the next call may succeed.
+    /// [`RenderError`]; images are then unspecified, and the next call may succeed.
     ///
     /// # Panics
-    /// If there are not as many images as cameras, or placements as objects.
+    /// If the number of images differs from that of the cameras, or the number of placements from that of the
+    /// objects.
     fn render(
         &mut self,
         placements: &[Placement],
@@ -24,34 +25,34 @@ pub trait Rasterizer: Send {
         images: &mut [RgbdImage],
     ) -> Result<PassTimes, RenderError>;
 
-    /// Returns how much work the last camera was.
+    /// Returns the amount of work for the last camera.
     fn workload(&self) -> Workload;
 }
 
-/// How long each pass took, summed over the cameras of a call; 0 where a renderer has no such pass
-/// or cannot time it. [ms]
+/// Duration of each pass, summed over the cameras of a call; 0 if the renderer does not have the pass or cannot time
+/// it. [ms]
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PassTimes {
-    /// Blocks of splats against the view. [ms]
+    /// Test of the blocks of splats against the view. [ms]
     pub cull_ms: f32,
-    /// Splats onto the image plane. [ms]
+    /// Projection of splats onto the image plane. [ms]
     pub project_ms: f32,
-    /// By depth. [ms]
+    /// Sorting by depth. [ms]
     pub sort_ms: f32,
-    /// Into tiles. [ms]
+    /// Assignment of splats to tiles. [ms]
     pub bin_ms: f32,
-    /// Tiles to pixels. [ms]
+    /// Blending of tiles to pixels. [ms]
     pub blend_ms: f32,
-    /// From the device's memory to the images. [ms]
+    /// Copy from the device's memory to the images. [ms]
     pub read_ms: f32,
-    /// The whole call. [ms]
+    /// Complete call. [ms]
     pub total_ms: f32,
 }
 
-/// How much work an image was.
+/// Amount of work for an image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Workload {
-    /// Splats the renderer keeps.
+    /// Splats in the renderer's packed scene.
     pub splats: usize,
     /// Splats that touch the image.
     pub visible: usize,
@@ -59,24 +60,26 @@ pub struct Workload {
     pub pairs: usize,
 }
 
-/// Why nothing was rendered.
+/// Why rendering failed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RenderError {
-    /// The first camera that is not valid; no image is changed.
+    /// First invalid camera; no image is changed.
     #[error(transparent)]
     Camera(#[from] InvalidCamera),
-    /// The placement of an object is no rotation and finite position; no image is changed.
-    #[error("object {0} is placed at {1}, which is no rotation and finite position within 1e7 m")]
+    /// Placement of an object is not a rotation and a finite position; no image is changed.
+    #[error(
+        "object {0} is placed at {1}, which is not a rotation and a finite position within 1e7 m"
+    )]
     Placement(usize, String),
-    /// The graphics device is gone, or cannot hold what was asked of it, and why.
+    /// Graphics device is lost or out of memory; with the reason.
     #[error("the graphics device cannot render this: {0}; use the processor")]
     Device(String),
-    /// A packed scene cannot be read, or an image that is to be whole needs more memory than it has; and why.
+    /// Packed scene cannot be read, or a complete image needs more memory than is available; with the reason.
     #[error("{0}")]
     Scene(String),
 }
 
-/// Checks what every renderer asks of a call.
+/// Checks the arguments of a call to any renderer.
 pub(crate) fn validate(
     objects: usize,
     placements: &[Placement],

@@ -1,9 +1,9 @@
-//! The plain renderer: what every fast one must equal. Kept simple and in f64, on purpose slow.
+//! Reference renderer, to which all fast renderers must agree. Simple, in f64, and slow on purpose.
 //!
-//! "Classic" 3D Gaussian splatting (Kerbl et al. 2023, section 4 and appendix A): each Gaussian is
-//! linearised at its centre, `J W Sigma W^T J^T + 0.3 I`; the nearest is blended first, by camera
-//! z; a pixel takes a splat where `alpha = min(0.99, o exp(-sigma)) >= 1/255`, and ends *before*
-//! the splat that would bring its transmittance to 1e-4 or below.
+//! Classic 3D Gaussian splatting (Kerbl et al. 2023, section 4 and appendix A). Each Gaussian is linearised at its
+//! centre, `J W Sigma W^T J^T + 0.3 I`. Splats are blended from near to far, by camera z. A pixel takes a splat if
+//! `alpha = min(0.99, o exp(-sigma)) >= 1/255`, and ends *before* the splat that would reduce its transmittance to
+//! 1e-4 or below.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Frame, Pose};
@@ -13,14 +13,14 @@ use crate::limits::{ALPHA_MAX, ALPHA_MIN, BLUR_PX2, MAX_SCALE_M, TRANSMITTANCE_M
 use crate::rasterizer::{self, RenderError};
 use crate::{Camera, Placement, RgbdImage, Scene, Splats};
 
-/// Returns the image of a scene seen by `camera`, its objects placed: RGB on the background, alpha,
-/// expected and median camera-z depth [m, cam], ids.
+/// Renders a scene with placed objects: RGB on the background, alpha, expected and median camera-z depth [m, cam],
+/// ids.
 ///
 /// # Errors
-/// [`RenderError`] names what is wrong with the camera or a placement.
+/// [`RenderError`] if the camera or a placement is invalid.
 ///
 /// # Panics
-/// If there are not as many placements as objects.
+/// If the number of placements differs from that of the objects.
 pub fn render_reference<'a>(
     scene: impl Into<Scene<'a>>,
     placements: &[Placement],
@@ -44,7 +44,7 @@ pub fn render_reference<'a>(
     add(scene.splats, 0, CameraInScene::from(&camera.world_from_cam));
     for (object, placement) in scene.objects.iter().zip(placements) {
         if let Some(world_from_object) = placement {
-            // An object that moves is one that stands still before a camera that moves.
+            // A moving object before a camera is the same as a static object before a moving camera.
             let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
             add(&object.splats, object.id, CameraInScene::from(&object_from_cam));
         }
@@ -54,7 +54,7 @@ pub fn render_reference<'a>(
     Ok(image)
 }
 
-/// Where the camera is, from a part of the scene.
+/// Pose of the camera relative to a part of the scene.
 struct CameraInScene {
     rotation: DMat3,
     center_m: DVec3,
@@ -67,7 +67,7 @@ impl<F: Frame> From<&Pose<F, Cam>> for CameraInScene {
     }
 }
 
-/// What of the camera's lens is worth computing once.
+/// Values of the lens that are computed once per camera.
 struct Lens {
     slopes: [DVec2; 2],
     reach: f64,
@@ -79,12 +79,12 @@ impl Lens {
     }
 }
 
-/// A Gaussian on the image plane.
+/// Gaussian on the image plane.
 struct Projected {
     mean_px: DVec2,
     /// Inverse covariance: xx, xy, yy. [1/px^2]
     conic: [f64; 3],
-    /// Half of the bounding box of `alpha >= 1/255`. [px]
+    /// Half of the bounding box of the ellipse `alpha >= 1/255`. [px]
     extent_px: DVec2,
     z_m: f64,
     id: u16,
@@ -92,7 +92,7 @@ struct Projected {
     rgb: DVec3,
 }
 
-/// Projects one splat; `None` if it cannot touch the image.
+/// Projects one splat; returns `None` if it cannot touch the image.
 fn project(
     splats: &Splats,
     i: usize,
@@ -105,14 +105,14 @@ fn project(
     let mean = splats.means_m[i].as_dvec3();
     let p_cam = camera_in_scene.rotation * (mean - camera_in_scene.center_m);
     let slope = p_cam.truncate() / p_cam.z;
-    // Positive, so that NaN is refused.
+    // Written so that NaN is rejected.
     if !(p_cam.z > f64::from(camera.near_m) && slope.length() <= lens.reach) {
         return None;
     }
     let focal = DVec2::new(k.fx_px, k.fy_px);
     let mean_px = focal * k.distortion.distort(slope).0 + DVec2::new(k.cx_px, k.cy_px);
 
-    // The linearisation blows up outside the image: take it at the nearest point just outside.
+    // The linearisation diverges outside the image: it is taken at the nearest slope within the bounds.
     let at = slope.clamp(lens.slopes[0], lens.slopes[1]).clamp_length_max(lens.reach);
     let (_, bend) = k.distortion.distort(at);
 
@@ -130,7 +130,7 @@ fn project(
     let c = row_y.dot(row_y) + BLUR_PX2;
     let determinant = a * c - b * b;
 
-    // alpha >= 1/255 where sigma <= ln(255 o); the bounding box of that ellipse.
+    // alpha >= 1/255 where sigma <= ln(255 o): the bounding box of that ellipse.
     let opacity = f64::from(splats.opacities[i])
         * if splats.antialiased { unblurred(&row_x, &row_y, determinant) } else { 1.0 };
     let reach = 2.0 * (opacity / ALPHA_MIN).ln();
@@ -162,15 +162,15 @@ fn project(
     })
 }
 
-/// Returns by what an anti-aliased splat is dimmed, so that the pixel's blur adds nothing to what it covers: the square
-/// root of the covariance's determinant without the blur over that with it. (Yu et al. 2024,
+/// Returns the factor that dims an anti-aliased splat, so that the pixel's blur does not add to its covered area: the
+/// square root of the covariance's determinant without blur, divided by that with blur. (Yu et al. 2024,
 /// "Mip-Splatting", equation 10; the compensation of gsplat's `rasterize_mode="antialiased"`.)
 fn unblurred(row_x: &DVec3, row_y: &DVec3, determinant: f64) -> f64 {
-    // By Cauchy and Binet the sum of squared minors, which is never below 0.
+    // Cauchy-Binet: the sum of squared minors, never below 0.
     (row_x.cross(*row_y).length_squared() / determinant).sqrt()
 }
 
-/// Blends splats, nearest first.
+/// Blends splats from near to far.
 fn blend(projected: &[Projected], camera: &Camera, image: &mut RgbdImage) {
     let k = &camera.intrinsics;
     let (width, height) = (k.width_px as usize, k.height_px as usize);

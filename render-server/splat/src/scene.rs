@@ -1,15 +1,15 @@
-//! What a renderer is given once: the twin, and the rigid objects that move in it.
+//! Input of a renderer: the twin, and the rigid objects that move in it.
 
 use vizflyt_protocol::geometry::{Object, Pose, World};
 
 use crate::Splats;
 
-/// A twin and what moves in it; borrowed, because every renderer packs its own copy.
+/// Twin and moving objects. Borrowed, because every renderer packs its own copy.
 #[derive(Clone, Copy, Debug)]
 pub struct Scene<'a> {
-    /// What stands still. [m, world]
+    /// Static part. [m, world]
     pub splats: &'a Splats,
-    /// What moves; placed again for every image, in this order.
+    /// Moving objects; placements have the same order.
     pub objects: &'a [RigidObject],
 }
 
@@ -19,14 +19,14 @@ impl<'a> From<&'a Splats> for Scene<'a> {
     }
 }
 
-/// A rigid part of a scene with a pose of its own: a door, a clock's hand, another vehicle.
+/// Rigid part of a scene with its own pose: a door, the hand of a clock, another vehicle.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RigidObject {
-    /// What [`crate::RgbdImage::ids`] holds where it is seen; 0 is what stands still.
+    /// Value in [`crate::RgbdImage::ids`] where the object is visible; 0 is the static part.
     pub id: u16,
-    /// Its splats. [m, object]
+    /// Splats of the object. [m, object]
     pub splats: Splats,
 }
 
-/// Where an object is while an image is rendered; `None` where it is not there at all.
+/// Pose of an object while an image is rendered; `None` if the object is absent.
 pub type Placement = Option<Pose<World, Object>>;

@@ -1,4 +1,4 @@
-//! A scene in memory: activated parameters, structure of arrays.
+//! Scene in memory: activated parameters, structure of arrays.
 
 use glam::{Quat, Vec3};
 
@@ -9,18 +9,20 @@ use glam::{Quat, Vec3};
 pub struct Splats {
     /// Centres. [m, world]
     pub means_m: Vec<Vec3>,
-    /// Standard deviations along the Gaussian's own axes (already exponentiated). [m]
+    /// Standard deviations along the axes of the Gaussian (after the exponential). [m]
     pub scales_m: Vec<Vec3>,
-    /// The Gaussian's axes in the world; unit.
+    /// Rotation of the Gaussian's axes in the world; unit quaternions.
     pub rotations: Vec<Quat>,
-    /// Peak opacity, 0 to 1 (already through the sigmoid).
+    /// Peak opacity, 0 to 1 (after the sigmoid).
     pub opacities: Vec<f32>,
-    /// Degree of the harmonics, 0 to 3.
+    /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u8,
-    /// Coefficients, splat by splat, coefficient by coefficient, RGB within; the constant first.
+    /// Coefficients: splat by splat, in each splat coefficient by coefficient from the constant on, in each
+    /// coefficient RGB.
     pub sh: Vec<f32>,
-    /// Whether they were trained with anti-aliasing (mip-splatting; gsplat's `antialiased`, brush's `mip`): the
-    /// renderer then dims each by what the pixel's blur adds to its area. Read from the file where it says so.
+    /// Whether the splats were trained with anti-aliasing (mip-splatting; gsplat's `antialiased`, brush's `mip`). The
+    /// renderer then dims each splat by the area that the pixel's blur adds. Read from the file if it contains the
+    /// setting.
     pub antialiased: bool,
 }
 
@@ -30,7 +32,7 @@ impl Splats {
         self.means_m.len()
     }
 
-    /// Whether there are none.
+    /// Whether the scene has no splats.
     pub fn is_empty(&self) -> bool {
         self.means_m.is_empty()
     }

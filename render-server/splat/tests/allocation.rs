@@ -1,5 +1,5 @@
-//! The CPU renderer allocates while its buffers grow, and nothing after: whatever the poses, the
-//! cameras, their lenses, and the objects that come and go. Nor do the sensors behind its images, and those beside its cameras.
+//! The CPU renderer allocates only while its buffers grow, for any poses, cameras, lenses, and appearing or absent
+//! objects. The same applies to the image sensors and the beam sensors.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -27,7 +27,7 @@ use vizflyt_splat::{
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
 
-/// A pool whose threads' allocations are counted, and no others': tests run next to each other in one process.
+/// Thread pool that counts only the allocations of its own threads, because tests run concurrently in one process.
 struct Pool {
     threads: ThreadPool,
     count: &'static AtomicUsize,
@@ -41,12 +41,12 @@ impl Pool {
             .start_handler(move |_| CountingAllocator::count_in(count))
             .build()
             .expect("a pool");
-        // A thread allocates as it starts, which on a loaded machine may be late: here all have.
+        // A thread allocates when it starts, which can be delayed on a loaded machine: this waits for all of them.
         threads.broadcast(|_| ());
         Self { threads, count }
     }
 
-    /// Returns the result of `work` on the pool's own threads: rayon allocates a little to take in work from outside.
+    /// Runs `work` on the pool's own threads: rayon allocates a little to accept work from outside.
     fn install<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
         self.threads.install(work)
     }
@@ -56,11 +56,11 @@ impl Pool {
     }
 }
 
-/// `count` splats all around, up to 4 m away.
+/// Returns `count` splats in all directions, up to 4 m away.
 fn cloud(count: u32, half_m: f32) -> Splats {
     let mut splats = Splats::default();
     for i in 0..count {
-        // Fractions of multiples of irrational numbers: spread, and the same every time.
+        // Fractions of multiples of irrational numbers: evenly spread and reproducible.
         let spread = |k: f64| (f64::from(i) * k).fract() as f32 * 2.0 - 1.0;
         let at = Vec3::new(spread(0.618_034), spread(0.414_214), spread(0.732_051));
         splats.means_m.push(at * half_m);
@@ -85,7 +85,7 @@ fn cameras(turn: u32) -> Vec<Camera> {
         pinhole,
         Intrinsics { distortion: barrel, ..pinhole },
         Intrinsics { distortion: fisheye, ..small },
-        // Out where there is nothing to see: the buffers stand empty.
+        // Outside the scene: the buffers are empty.
         pinhole,
     ]
     .into_iter()
@@ -111,7 +111,7 @@ fn placements(turn: u32) -> [Placement; 2] {
 }
 
 #[test]
-fn nothing_is_allocated_once_every_view_was_seen() {
+fn allocates_nothing_after_the_first_pass_over_all_views() {
     const TURNS: u32 = 13;
     let splats = cloud(60_000, 4.0);
     let objects = [1, 2].map(|id| RigidObject { id, splats: cloud(2000, 0.5) });
@@ -131,7 +131,7 @@ fn nothing_is_allocated_once_every_view_was_seen() {
         assert!(counts[0] > 0, "the counter counts");
         assert_eq!(counts[1..], [0, 0, 0], "{}", renderer.name());
     }
-    // And what cameras make of the images.
+    // Also checks the sensor effects on these images.
     let mut renderer = CpuRenderer::new(&splats);
     let camera = calls[1].1[0];
     let mut clean = [RgbdImage::default()];
@@ -207,12 +207,12 @@ fn models() -> [CameraModel; 2] {
 }
 
 #[test]
-fn sensors_allocate_nothing_after_their_first_measurement() {
+fn sensors_allocate_nothing_after_the_first_pass() {
     let splats = cloud(20_000, 4.0);
     let objects = [1, 2].map(|id| RigidObject { id, splats: cloud(500, 0.5) });
     let scene = SensorScene::new(Scene { splats: &splats, objects: &objects });
     let pool = Pool::new();
-    // Motions of the sensor and the objects, of which one comes and goes.
+    // Motions of the sensor and the objects; one object appears and disappears.
     let turns: Vec<_> = (0..7).map(|turn| (placements(turn), placements(turn + 1))).collect();
     for (name, _, preset) in PRESETS {
         let mut sensor = Prepared::new(preset());
@@ -233,12 +233,12 @@ fn sensors_allocate_nothing_after_their_first_measurement() {
                 pool.allocations() - before
             })
         });
-        // Beams look into a cloud all around: whoever keeps records has grown them in the first pass.
+        // Beams hit a cloud in all directions: the records have grown in the first pass.
         assert_eq!(counts[1..], [0, 0], "{name}");
     }
 }
 
-/// A sensor, and the records that it fills.
+/// Sensor with its output buffer.
 enum Prepared {
     Lidar(Lidar, Vec<LidarPoint>),
     Range(RangeFinder),
@@ -261,7 +261,10 @@ impl Prepared {
         match self {
             Self::Lidar(lidar, points) => {
                 lidar.scan(scene, motion, 1, seq, points).expect(valid);
-                assert!(points.iter().any(|point| point.range_m > 0.0), "it sees the cloud");
+                assert!(
+                    points.iter().any(|point| point.range_m > 0.0),
+                    "the cloud is not detected"
+                );
             }
             Self::Range(finder) => drop(finder.measure(scene, motion, 1, seq).expect(valid)),
             Self::Sonar(sonar) => drop(sonar.measure(scene, motion, 1, seq).expect(valid)),
@@ -273,7 +276,7 @@ impl Prepared {
 }
 
 #[test]
-fn weather_allocates_nothing_once_every_view_was_seen() {
+fn weather_allocates_nothing_after_the_first_pass_over_all_views() {
     const TURNS: u32 = 13;
     let weather = Weather {
         cloud: Some(Cloud {

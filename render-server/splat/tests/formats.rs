@@ -1,11 +1,11 @@
-//! Files that other people's tools wrote from known splats; how they were made is documented beside them.
+//! Files written by third-party tools from known splats; the files next to them document how they were made.
 
 use std::path::{Path, PathBuf};
 
 use vizflyt_splat::Splats;
 use vizflyt_splat::format::{self, Format, Loaded};
 
-/// What a file may have lost: whole steps, as some writers cut where others round.
+/// Maximum loss of a format: whole quantisation steps, because some writers truncate and others round.
 struct Loss {
     mean_m: f32,
     log_scale: f32,
@@ -15,7 +15,7 @@ struct Loss {
     harmonic: f32,
 }
 
-/// A step of a colour byte, as a constant harmonic.
+/// One step of a colour byte, as a constant harmonic.
 const COLOUR: f32 = 1.0 / 255.0 / 0.282_094_8;
 const BYTES: Loss = Loss {
     mean_m: 1e-5,
@@ -43,7 +43,7 @@ fn read(name: &str) -> Loaded {
     format::read(data(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
 }
 
-/// Reads a file and compares it with the known scene of its degree, splat by nearest splat.
+/// Reads a file and compares it with the known scene of its degree, each splat with its nearest one.
 fn check(name: &str, expected: Format, sh_degree: u8, loss: &Loss) {
     let loaded = read(name);
     let known: Splats = read(&format!("known-sh{sh_degree}.ply")).splats;
@@ -119,12 +119,12 @@ fn splat_transform_glb() {
 #[test]
 fn splat_transform_streamed_sog() {
     let folder = data("splat-transform-streamed-sh1");
-    // 128 splats of degree 1 at the finest level, 40 at the other, and 128 of degree 0 around them.
+    // 128 splats of degree 1 at the finest level, 40 at the other, and 128 of degree 0 in the environment.
     let finest = format::read(&folder).expect("a scene");
     assert_eq!(finest, format::read(folder.join("lod-meta.json")).expect("a scene"));
     assert_eq!((finest.splats.len(), finest.splats.sh_degree), (256, 1));
     assert_eq!(format::read_level(&folder, 1).expect("a scene").splats.len(), 168);
-    // What the whole is made of is there one by one.
+    // Each chunk of the scene is also a readable file.
     let chunk = format::read(folder.join("0_0/meta.json")).expect("a scene").splats;
     assert_eq!(finest.splats.means_m[..128], chunk.means_m);
     assert_eq!(finest.splats.sh[..128 * 12], chunk.sh);
@@ -141,7 +141,7 @@ fn splat_transform_streamed_sog() {
 fn spz_of_every_container() {
     check("splat-transform-spz3-sh3.spz", Format::Spz, 3, &SPZ);
     check("splat-transform-spz4-sh1.spz", Format::Spz, 1, &SPZ);
-    // Version 2 keeps three bytes of the quaternion, from which w follows: near half a turn, poorly.
+    // Version 2 stores three bytes of the quaternion, from which w follows: inaccurate near half a turn.
     let loss = Loss { rotation_rad: 0.3, ..SPZ };
     check("gaussforge-spz2-sh2.spz", Format::Spz, 2, &loss);
 }

@@ -1,5 +1,5 @@
-//! Loading a scene takes at most twice the memory that it takes once loaded. (The file itself is
-//! mapped: its pages are the system's to drop.) Alone in its binary.
+//! Loading a scene takes at most twice the memory of the loaded scene. (The file is mapped, and its pages can be
+//! dropped by the system.) In a separate binary, because it counts allocations.
 
 use glam::{Quat, Vec3};
 use vizflyt_fixtures::CountingAllocator;
@@ -9,7 +9,7 @@ use vizflyt_splat::format::{self, Format};
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
 
-/// Splats that compress as badly as real ones.
+/// Returns splats that compress as badly as real ones.
 fn scene(count: usize, sh_degree: u8) -> Splats {
     let mut splats = Splats { sh_degree, ..Splats::default() };
     let mut state = 1u32;
@@ -30,7 +30,7 @@ fn scene(count: usize, sh_degree: u8) -> Splats {
 }
 
 #[test]
-fn a_load_takes_at_most_twice_the_scene() {
+fn loading_takes_at_most_twice_the_memory_of_the_scene() {
     for (format, sh_degree) in
         Format::ALL.into_iter().flat_map(|f| [0, f.max_sh_degree()].map(|degree| (f, degree)))
     {

@@ -1,7 +1,7 @@
-//! The optimiser: Adam (Kingma and Ba 2015) on the rows that an image shows.
+//! Optimiser: Adam (Kingma and Ba 2015) on the rows visible in an image.
 //!
-//! Rows that no pixel of the image saw keep their moments (as in Mallick et al. 2024, "Taming 3DGS"):
-//! their gradient is not zero, it is unknown.
+//! Rows that no pixel of the image sees keep their moments (as in Mallick et al. 2024, "Taming 3DGS"): their gradient
+//! is unknown, not zero.
 
 use rayon::prelude::*;
 use vizflyt_splat::simd::{InstructionSet, Kernel, Simd};
@@ -13,7 +13,7 @@ const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
 
-/// Steps of each group of columns.
+/// Learning rates of each group of columns.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rates {
     /// Means. [units of the dataset]
@@ -24,61 +24,61 @@ pub struct Rates {
     pub rotation: f32,
     /// Logits.
     pub logit: f32,
-    /// The constant harmonic.
+    /// Constant harmonic.
     pub sh: f32,
-    /// The other harmonics.
+    /// Other harmonics.
     pub sh_rest: f32,
 }
 
-/// What every row pays, so that no haze and no needles are left; each as a mean over all rows.
+/// Regularisation weights against haze and needles; each applies to a mean over all rows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tolls {
-    /// Of the opacity.
+    /// Weight of the opacity.
     pub opacity: f32,
-    /// Of the scales, in extents of the capture.
+    /// Weight of the scales, relative to the extent of the capture.
     pub scale: f32,
-    /// Of the least scale, likewise: a surface is flat.
+    /// Weight of the smallest scale, relative to the extent: surfaces are flat.
     pub thickness: f32,
-    /// Of the logarithm of the greatest scale over the middle one, beyond [`MAX_RATIO`].
+    /// Weight of the log ratio of the largest scale to the middle one, above [`MAX_RATIO`].
     pub needle: f32,
 }
 
-/// Discs may be as oblong as this.
+/// Maximum unpenalised ratio of a disc's two larger scales.
 const MAX_RATIO: f32 = 3.0;
 
 /// First and second moments of every row.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Moments {
-    /// Of the gradient.
+    /// Moments of the gradient.
     pub first: Gaussians,
-    /// Of its square.
+    /// Moments of its square.
     pub second: Gaussians,
 }
 
 impl Moments {
-    /// Returns those of rows that have not moved.
+    /// Returns zero moments.
     pub fn of(gaussians: &Gaussians) -> Self {
         Self { first: gaussians.zeros(), second: gaussians.zeros() }
     }
 }
 
-/// One step of all rows that were seen.
+/// One optimiser step of all visible rows.
 pub(crate) struct AdamStep<'a> {
-    /// Ascending, as many as gradients.
+    /// Visible rows, ascending, one per gradient.
     pub(crate) seen: &'a [u32],
     pub(crate) gradients: &'a [RowGradient],
-    /// From 1.
+    /// Step number, from 1.
     pub(crate) number: u32,
     pub(crate) rates: Rates,
     pub(crate) tolls: Tolls,
-    /// Of the capture. [units of the dataset]
+    /// Extent of the capture. [units of the dataset]
     pub(crate) extent: f32,
-    /// Degree of the harmonics that count.
+    /// Degree of the harmonics used.
     pub(crate) degree: u8,
 }
 
 impl AdamStep<'_> {
-    /// Moves the rows.
+    /// Updates the rows.
     pub(crate) fn apply(
         &self,
         instructions: InstructionSet,
@@ -110,7 +110,7 @@ impl AdamStep<'_> {
             });
     }
 
-    /// Returns the gradient of a row, tolls included, to the end of the degree that counts.
+    /// Returns the gradient of a row including regularisation, up to the harmonics used.
     #[inline(always)]
     fn gradient(&self, row: &[f32], by: &RowGradient, rows: usize) -> [f32; 59] {
         let mut out = [0.0; 59];
@@ -173,7 +173,7 @@ impl Kernel for Rows<'_> {
             let at = (row as usize - self.first_row) * self.stride;
             let values = &mut self.values[at..at + counted];
             let gradient = self.step.gradient(values, by, self.rows);
-            // A row that came out wrong somewhere stays where it is.
+            // A row with an invalid gradient stays unchanged.
             if !is_finite(&gradient) {
                 continue;
             }
@@ -189,7 +189,7 @@ impl Kernel for Rows<'_> {
     }
 }
 
-/// Whether the sum of some numbers is finite; in eight parts, which the processor adds at once.
+/// Returns whether the sum of the numbers is finite, in eight partial sums (for SIMD).
 #[inline(always)]
 fn is_finite(numbers: &[f32]) -> bool {
     let mut sums = [0.0f32; 8];
@@ -207,7 +207,7 @@ mod tests {
     use glam::{Quat, Vec3};
 
     #[test]
-    fn steps_are_as_long_as_their_rates_and_go_downhill() {
+    fn first_step_equals_the_rate_and_goes_downhill() {
         let mut gaussians = Gaussians::new(0);
         for _ in 0..3 {
             gaussians.push(Vec3::ZERO, Vec3::splat(0.1), Quat::IDENTITY, 0.5, [0.5; 3]);
@@ -232,7 +232,7 @@ mod tests {
         step.apply(InstructionSet::available()[0], &mut gaussians, &mut moments);
         assert_eq!(gaussians.row(0), before.row(0));
         assert_eq!(gaussians.row(2), before.row(2));
-        // The first step of Adam is its rate, whatever the gradient's length.
+        // Adam's first step equals its rate, for any gradient length.
         assert!((gaussians.row(1)[column::MEAN] + 0.1).abs() < 1e-6);
         assert!((gaussians.row(1)[column::LOGIT] - 0.4).abs() < 1e-6);
         assert_eq!(gaussians.row(1)[column::LOG_SCALE], before.row(1)[column::LOG_SCALE]);

@@ -1,25 +1,24 @@
-//! Pass 2: which flat Gaussians touch which tile, nearest first; and the way back from a tile's list
-//! to them.
+//! Pass 2: bins projected Gaussians into tiles, nearest first, and indexes the bins by Gaussian for the backward pass.
 //!
-//! One thread: a radix sort by depth, then the pairs in that order, scattered to tiles. Some 10 ns a
-//! Gaussian and 5 ns a pair.
+//! Single-threaded: a radix sort by depth, then the pairs in that order, scattered to tiles. It takes about 10 ns per
+//! Gaussian and 5 ns per pair.
 
 use crate::planes::TILE;
 use crate::project::{Flat, MIN_LEVEL};
 
-/// Lists per tile, and per Gaussian where it stands in them.
+/// Gaussians of each tile, and the entries of each Gaussian in these lists.
 #[derive(Debug, Default)]
 pub(crate) struct Bins {
     pub(crate) tiles_x: usize,
-    /// Where each tile's list starts; one more than there are tiles.
+    /// Start of each tile's list in `entries`; length: number of tiles + 1.
     pub(crate) starts: Vec<u32>,
     /// Indices of flat Gaussians, tile by tile, nearest first.
     pub(crate) entries: Vec<u32>,
-    /// Where the pairs of each Gaussian start in `places`; one more than there are Gaussians.
+    /// Start of each Gaussian's indices in `places`; length: number of Gaussians + 1.
     pub(crate) firsts: Vec<u32>,
-    /// Places in `entries`, Gaussian by Gaussian.
+    /// Indices into `entries`, Gaussian by Gaussian.
     pub(crate) places: Vec<u32>,
-    /// Indices in order of depth, and what the sort needs.
+    /// Indices in order of depth, and the sort's second buffer.
     order: Vec<u32>,
     spare: Vec<u32>,
     /// Tile of each pair, Gaussian by Gaussian in order of depth.
@@ -28,7 +27,7 @@ pub(crate) struct Bins {
 }
 
 impl Bins {
-    /// Bins what is seen in an image.
+    /// Bins the projected Gaussians of an image.
     pub(crate) fn bin(&mut self, flats: &[Flat], width: usize, height: usize) {
         self.tiles_x = width.div_ceil(TILE);
         let tiles = self.tiles_x * height.div_ceil(TILE);
@@ -71,7 +70,7 @@ impl Bins {
         }
     }
 
-    /// Orders by z, and by index where that is the same: bits of positive numbers order as they do.
+    /// Sorts by z, then by index: positive floats have the same order as their bits.
     fn sort(&mut self, flats: &[Flat]) {
         const BITS: u32 = 11;
         self.order.clear();
@@ -98,9 +97,9 @@ impl Bins {
     }
 }
 
-/// Notes the tiles that the ellipse alpha >= 1/255 touches.
+/// Appends the tiles touched by the ellipse alpha >= 1/255.
 fn note(flat: &Flat, tiles_x: usize, width: usize, height: usize, tiles: &mut Vec<u32>) {
-    // Pixels whose centres lie in a range, both ends included; empty if there are none.
+    // Pixels whose centres lie in the range, both ends included; `None` if there are none.
     let centers = |low: f32, high: f32, size: usize| {
         let first = (low - 0.5).ceil().max(0.0) as usize;
         let last = (high - 0.5).floor().min(size as f32 - 1.0);
@@ -119,7 +118,7 @@ fn note(flat: &Flat, tiles_x: usize, width: usize, height: usize, tiles: &mut Ve
         let low = high + (TILE - 1) as f32;
         let left = edge((-flat.tip_y).max(high).min(low), -1.0);
         let right = edge(flat.tip_y.max(high).min(low), 1.0);
-        // A hair wider than the ellipse: rounding loses no pixel.
+        // Slightly wider than the ellipse, so that rounding loses no pixel.
         if let Some((left, right)) = centers(left - 1e-3, right + 1e-3, width) {
             let row = tile_y * tiles_x;
             tiles.extend((row + left / TILE..=row + right / TILE).map(|tile| tile as u32));

@@ -1,10 +1,8 @@
-//! What is trained: Gaussians in the form that an optimiser may change freely, one row of numbers
-//! each.
+//! Trained parameters: Gaussians in an unconstrained form for the optimiser, one row of numbers each.
 //!
-//! A row holds mean [3, units of the dataset], natural logarithms of the scales [3], rotation [4,
-//! xyzw, of any length but 0], logit of the opacity, and the harmonics (coefficient by coefficient,
-//! RGB within), as Kerbl et al. 2023 parametrise them. Rows make moments of the optimiser, copies and
-//! checkpoints the same three lines.
+//! A row holds mean [3, units of the dataset], natural logarithms of the scales [3], rotation [4, xyzw, any length
+//! except 0], logit of the opacity, and the harmonics (coefficient by coefficient, RGB within), as in Kerbl et al.
+//! 2023. Uniform rows make the optimiser's moments, copies and checkpoints simple.
 
 use std::ops::Range;
 
@@ -12,7 +10,7 @@ use glam::{Quat, Vec3};
 use rayon::prelude::*;
 use vizflyt_splat::Splats;
 
-/// Where a row's numbers are.
+/// Column indices of a row.
 pub mod column {
     /// Mean, 3.
     pub const MEAN: usize = 0;
@@ -26,23 +24,23 @@ pub mod column {
     pub const SH: usize = 11;
 }
 
-/// Rows of parameters, or of anything that has as many.
+/// Rows of parameters, or of other values with the same layout.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gaussians {
     /// Degree of the harmonics, 0 to 3.
     pub degree: u8,
-    /// Row by row, [`Self::stride`] numbers each.
+    /// Values, row by row, [`Self::stride`] each.
     pub values: Vec<f32>,
 }
 
 impl Gaussians {
-    /// Returns none, of a degree.
+    /// Returns an empty set with harmonics of a degree.
     pub fn new(degree: u8) -> Self {
         assert!(degree <= 3, "harmonics go to degree 3");
         Self { degree, values: Vec::new() }
     }
 
-    /// Returns the numbers of a row: 14, 23, 38 or 59.
+    /// Returns the number of values per row: 14, 23, 38 or 59.
     pub fn stride(&self) -> usize {
         column::SH + 3 * coefficients(self.degree)
     }
@@ -52,24 +50,23 @@ impl Gaussians {
         self.values.len() / self.stride()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no rows.
     pub fn is_empty(&self) -> bool {
         self.values.is_empty()
     }
 
-    /// Returns a row.
     pub fn row(&self, i: usize) -> &[f32] {
         let stride = self.stride();
         &self.values[i * stride..(i + 1) * stride]
     }
 
-    /// Returns a row to change.
+    /// Returns a mutable row.
     pub fn row_mut(&mut self, i: usize) -> &mut [f32] {
         let stride = self.stride();
         &mut self.values[i * stride..(i + 1) * stride]
     }
 
-    /// Calls `change` with each of some rows, which ascend, on all cores.
+    /// Calls `change` for each of the given rows (in ascending order), in parallel.
     pub(crate) fn change(&mut self, rows: &[u32], change: impl Fn(u32, &mut [f32]) + Sync) {
         let stride = self.stride();
         self.values.par_chunks_mut(CHUNK * stride).enumerate().for_each(|(chunk, values)| {
@@ -81,12 +78,12 @@ impl Gaussians {
         });
     }
 
-    /// Returns as many rows of zeros.
+    /// Returns rows of zeros with the same layout.
     pub fn zeros(&self) -> Self {
         Self { degree: self.degree, values: vec![0.0; self.values.len()] }
     }
 
-    /// Appends a Gaussian of an even colour. [units of the dataset; sRGB, 0 to 1]
+    /// Appends a Gaussian of uniform colour. [units of the dataset; sRGB, 0 to 1]
     pub fn push(&mut self, mean: Vec3, scales: Vec3, rotation: Quat, opacity: f32, rgb: [f32; 3]) {
         let start = self.values.len();
         self.values.extend(mean.to_array());
@@ -112,7 +109,7 @@ impl Gaussians {
         gaussians
     }
 
-    /// Returns what a renderer renders; rows that are not finite are left out.
+    /// Returns the Gaussians as splats for rendering, without rows that are not finite.
     pub fn to_splats(&self) -> Splats {
         let mut splats = Splats { sh_degree: self.degree, ..Splats::default() };
         for row in self.values.chunks_exact(self.stride()) {
@@ -131,16 +128,16 @@ impl Gaussians {
     }
 }
 
-/// Rows that one thread takes at a time.
+/// Rows per unit of parallel work.
 pub(crate) const CHUNK: usize = 1024;
 
-/// Returns which of some ascending rows are in the chunk that begins with a row.
+/// Returns the range of the ascending `rows` that lies in the chunk starting at row `first`.
 pub(crate) fn within(rows: &[u32], first: usize) -> Range<usize> {
     let place = |row: usize| rows.partition_point(|&r| (r as usize) < row);
     place(first)..place(first + CHUNK)
 }
 
-/// Returns the coefficients of a degree: 1, 4, 9 or 16.
+/// Returns the number of coefficients of a degree: 1, 4, 9 or 16.
 pub(crate) fn coefficients(degree: u8) -> usize {
     (usize::from(degree) + 1).pow(2)
 }
@@ -160,7 +157,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn splats_come_back_as_they_were() {
+    fn converts_splats_without_loss() {
         let splats = Splats {
             means_m: vec![Vec3::new(1.0, -2.0, 3.0), Vec3::ZERO],
             scales_m: vec![Vec3::new(0.1, 0.02, 0.5), Vec3::splat(0.3)],
@@ -181,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_is_left_out() {
+    fn omits_rows_that_are_not_finite() {
         let mut gaussians = Gaussians::new(0);
         for _ in 0..3 {
             gaussians.push(Vec3::ZERO, Vec3::ONE, Quat::IDENTITY, 0.5, [0.2; 3]);

@@ -1,4 +1,4 @@
-//! The passes on a graphics card: `vizflyt_splat::gpu::training` in the trainer's words.
+//! Passes on a graphics card: adapts `vizflyt_splat::gpu::training` to the trainer's types.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -19,13 +19,13 @@ const _: () = assert!(
     "both have the same channels"
 );
 
-/// Renders Gaussians and takes derivatives back to them on a device.
+/// Renders Gaussians and propagates derivatives back to them on a device.
 #[derive(Debug)]
 pub(crate) struct GpuPasses {
     renderer: TrainingRenderer,
-    /// Of the view rendered last.
+    /// Last rendered image.
     image: Planes,
-    /// Where each row's gradient is in what the device found; [`UNSEEN`] where there is none.
+    /// Index of each row's gradient in the device's results; [`UNSEEN`] if the row has none.
     places: Vec<AtomicU32>,
 }
 
@@ -41,27 +41,27 @@ impl GpuPasses {
         })
     }
 
-    /// Returns `gpu`, the adapter's name and the interface.
+    /// Returns `gpu`, the adapter's name and the graphics API.
     pub(crate) fn name(&self) -> &str {
         self.renderer.name()
     }
 
-    /// Returns the image rendered last.
+    /// Returns the last rendered image.
     pub(crate) fn image(&self) -> &Planes {
         &self.image
     }
 
-    /// Returns where the time of all photos so far went.
+    /// Returns the device's time by part, over all photos.
     pub(crate) fn times(&self) -> TrainingTimes {
         self.renderer.times()
     }
 
-    /// Destroys the device, as a driver's reset does.
+    /// Destroys the device, as a driver reset does.
     pub(crate) fn lose_device(&self) {
         self.renderer.lose_device();
     }
 
-    /// Renders the image of a view; `changed` is what may differ from the Gaussians of the last one.
+    /// Renders a view. `changed` lists the Gaussians that may differ from the last call.
     pub(crate) fn forward(
         &mut self,
         gaussians: &Gaussians,
@@ -86,8 +86,8 @@ impl GpuPasses {
         self.renderer.forward(&gaussians.values, gaussians.stride(), changed, &photo, image)
     }
 
-    /// Takes the derivative of a loss by the last image's channels back: fills `seen` with the rows that it
-    /// shows, ascending, and `out` with as many gradients.
+    /// Propagates a derivative by the last image's channels: fills `seen` with the visible rows, in ascending order,
+    /// and `out` with one gradient each.
     pub(crate) fn backward(
         &mut self,
         gaussians: &Gaussians,
@@ -101,7 +101,7 @@ impl GpuPasses {
         self.renderer.backward(&by.values, |found| {
             places.resize_with(gaussians.len(), AtomicU32::default);
             places.par_iter_mut().with_min_len(1 << 14).for_each(|p| *p.get_mut() = UNSEEN);
-            // A row is found once: which thread notes it makes no difference.
+            // Each row occurs at most once, so the order of the threads does not matter.
             found.par_iter().enumerate().with_min_len(4096).for_each(|(place, found)| {
                 places[found.row()].store(place as u32, Ordering::Relaxed);
             });

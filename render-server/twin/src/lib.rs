@@ -1,4 +1,4 @@
-//! Images with known poses -> a twin: 3D Gaussian splats, trained on any processor, or any graphics card.
+//! Trains a twin (3D Gaussian splats) from images with known poses, on the processor or on a graphics card.
 
 pub mod adam;
 pub mod adjust;

@@ -1,8 +1,8 @@
-//! How far an image is from a photo, and the derivative by the image's channels.
+//! Difference between an image and a photo, and its derivative by the image's channels.
 //!
-//! `(1 - d) L1 + d (1 - SSIM)` of the exposed image (Kerbl et al. 2023, equation 7), plus what photos
-//! alone leave open: the depth of points that structure from motion has found, or of depth images, and
-//! the spread of depths along a ray (haze): `sum w (z - D)^2 / D^2` with `D` the ray's own mean depth.
+//! `(1 - d) L1 + d (1 - SSIM)` of the exposed image (Kerbl et al. 2023, equation 7), plus terms for what photos leave
+//! undetermined: the depth of points of structure from motion or of depth images, and the spread of depths along a ray
+//! (haze): `sum w (z - D)^2 / D^2` with `D` the ray's own mean depth.
 
 use rayon::prelude::*;
 use vizflyt_splat::simd::InstructionSet;
@@ -11,7 +11,7 @@ use crate::planes::{Planes, TILE};
 use crate::render::channel;
 use crate::{smooth, ssim};
 
-/// A photo and what is known of the depths in it.
+/// A photo and its known depths.
 #[derive(Clone, Debug, Default)]
 pub struct Target {
     /// Width. [px]
@@ -20,42 +20,40 @@ pub struct Target {
     pub height: usize,
     /// H x W x 3, sRGB.
     pub rgb: Vec<u8>,
-    /// H x W; 0 is not looked at. Empty: all of it is.
+    /// Mask, H x W; pixels with 0 are ignored. Empty: no mask.
     pub mask: Vec<u8>,
-    /// Points that were seen here.
+    /// Points visible in the photo.
     pub points: Vec<SeenPoint>,
-    /// H x W camera-z depth, 0 where it is unknown. Empty: there is none. [units of the dataset]
+    /// Camera-z depth, H x W, 0 where unknown. Empty: no depth image. [units of the dataset]
     pub depth: Vec<f32>,
 }
 
-/// A point of structure from motion as a photo saw it.
+/// A point of structure from motion in a photo.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SeenPoint {
     /// Pixel, y * width + x.
     pub pixel: u32,
-    /// Camera-z. [units of the dataset]
+    /// Camera-z depth. [units of the dataset]
     pub z: f32,
 }
 
-/// What counts how much.
+/// Weights of the parts of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
-    /// Share of the dissimilarity, 0 to 1.
+    /// Fraction of the dissimilarity in the colour loss, 0 to 1.
     pub dssim: f32,
-    /// Of the mean relative error of depth at points, and at pixels of a depth image.
+    /// Weight of the mean relative depth error at points and at pixels of a depth image.
     pub depth: f32,
-    /// Of the mean relative variance of depth along rays.
+    /// Weight of the mean relative variance of depth along rays.
     pub spread: f32,
-    /// Of the mean bend of inverse depth from pixel to pixel.
+    /// Weight of the mean second difference of inverse depth.
     pub bend: f32,
 }
 
-/// Brightness and colour of a photo against the others: `gain rgb + offset`, channel by channel.
+/// Brightness and colour of a photo relative to the others: `gain rgb + offset`, channel by channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exposure {
-    /// Factors.
     pub gain: [f32; 3],
-    /// What is added.
     pub offset: [f32; 3],
 }
 
@@ -66,8 +64,7 @@ impl Default for Exposure {
 }
 
 impl Exposure {
-    /// Returns the exposure that brings an image closest to a photo, channel by channel, by least
-    /// squares.
+    /// Returns the exposure that brings an image closest to a photo, channel by channel (least squares).
     pub(crate) fn fitting(image: &Planes, target: &Target) -> Self {
         let mut exposure = Self::default();
         for c in 0..3 {
@@ -96,23 +93,22 @@ impl Exposure {
     }
 }
 
-/// The parts of a loss.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Parts {
     /// Mean absolute error.
     pub l1: f64,
-    /// Mean structural similarity, to 1.
+    /// Mean structural similarity; at most 1.
     pub ssim: f64,
-    /// Mean relative error of depth.
+    /// Mean relative depth error.
     pub depth: f64,
     /// Mean relative variance of depth along rays.
     pub spread: f64,
-    /// Mean bend of inverse depth, in shares of its mean.
+    /// Mean second difference of inverse depth, relative to its mean.
     pub bend: f64,
 }
 
 impl Parts {
-    /// Returns the loss.
+    /// Returns the weighted sum.
     pub fn total(&self, weights: &Weights) -> f64 {
         let dssim = f64::from(weights.dssim);
         (1.0 - dssim) * self.l1
@@ -123,7 +119,7 @@ impl Parts {
     }
 }
 
-/// Computes losses; keeps its buffers.
+/// Computes losses. Buffers are reused between images.
 #[derive(Debug)]
 pub struct Loss {
     instructions: InstructionSet,
@@ -132,7 +128,7 @@ pub struct Loss {
     maps: Planes,
     by_shown: Planes,
     smooth: smooth::Scratch,
-    /// The derivative by the image's channels.
+    /// Derivative by the image's channels.
     by: Planes,
 }
 
@@ -177,7 +173,7 @@ impl Loss {
         let l1_step = ((1.0 - f64::from(weights.dssim)) / numbers) as f32;
         let ssim_step = (-f64::from(weights.dssim) / numbers) as f32;
         let rows = |band: usize| TILE.min(height - band * TILE);
-        // Of a band: absolute error, spread, derivatives by gain and offset; error of depth.
+        // Sums of a band: absolute error, spread, derivatives by gain and offset, depth error.
         let sums: Vec<[f64; 9]> = by
             .values
             .par_chunks_mut(len)
@@ -283,7 +279,7 @@ impl Loss {
         (-10.0 * (squares / numbers).max(1e-10).log10(), sum / numbers)
     }
 
-    /// Fills what is shown and what should be; where nobody looks, they are the same.
+    /// Fills `shown` and `truth`. Masked pixels are equal in both.
     fn expose(
         &mut self,
         image: &Planes,
@@ -325,13 +321,13 @@ impl Loss {
     }
 }
 
-/// Rays with less on them have no depth.
+/// Minimum alpha of a ray with a depth.
 const MIN_ALPHA: f32 = 0.1;
 
-/// What is on a ray.
+/// Sums along a ray.
 struct Ray {
     alpha: f32,
-    /// Mean depth, and mean of its square.
+    /// Mean depth and mean squared depth.
     mean: f32,
     square: f32,
 }
@@ -349,12 +345,12 @@ impl Ray {
         self.alpha * (self.square / (self.mean * self.mean) - 1.0).max(0.0)
     }
 
-    /// Returns the derivative of the spread, D held, by the sums of z and z^2 and by transmittance.
+    /// Returns the derivative of the spread at constant D, by the sums of z and z^2 and by transmittance.
     fn by_spread(&self) -> [f32; 3] {
         [-2.0 / self.mean, 1.0 / (self.mean * self.mean), -1.0]
     }
 
-    /// Returns the derivative of `|D / z - 1|`, likewise.
+    /// Returns the derivative of `|D / z - 1|` by the same sums.
     fn by_depth(&self, z: f32) -> [f32; 3] {
         let step = (self.mean / z - 1.0).signum() / (z * self.alpha);
         [step, 0.0, step * self.mean]

@@ -1,14 +1,14 @@
-//! How far the nearest points are: a k-d tree over points that stand still.
+//! Distances to the nearest neighbours, by a static k-d tree.
 
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Returns for each point the mean distance to its three nearest neighbours; 0 for a lone point.
+/// Returns the mean distance from each point to its three nearest neighbours; 0 for a single point.
 pub(crate) fn spacing(points: &[Vec3]) -> Vec<f32> {
     let mut order: Vec<u32> = (0..points.len() as u32).collect();
     build(points, &mut order, 0);
     let mean = |i: usize| {
-        // Squares, the nearest first; the point itself is the first of all.
+        // Squared distances in ascending order; the first is the point itself.
         let mut best = [f32::INFINITY; 4];
         search(points, &order, 0, points[i], &mut best);
         let known = best[1..].iter().filter(|d| d.is_finite());
@@ -18,7 +18,7 @@ pub(crate) fn spacing(points: &[Vec3]) -> Vec<f32> {
     (0..points.len()).into_par_iter().map(mean).collect()
 }
 
-/// Puts the median of each range in its middle, axis after axis.
+/// Places the median of each range at its middle, cycling through the axes.
 fn build(points: &[Vec3], order: &mut [u32], axis: usize) {
     if order.len() <= LEAF {
         return;
@@ -64,7 +64,7 @@ mod tests {
     use crate::random::Random;
 
     #[test]
-    fn spacing_is_that_of_brute_force() {
+    fn spacing_equals_brute_force() {
         let mut random = Random::new(8);
         let mut point = || Vec3::new(random.unit(), random.unit() * 3.0, random.normal());
         let mut points: Vec<Vec3> = (0..500).map(|_| point()).collect();

@@ -1,6 +1,6 @@
-//! What renders a training and takes derivatives back: the processor, or a graphics card with the processor
-//! behind it. A device that is lost costs one step's rendering again, for the Gaussians and the optimiser are
-//! the host's.
+//! Selects the device of a training's passes: the processor, or a graphics card with the processor as fallback. If a
+//! device is lost, only one step's rendering is repeated, because the Gaussians and the optimiser are in the host's
+//! memory.
 
 mod trial;
 
@@ -19,9 +19,9 @@ use crate::view::View;
 #[derive(Debug)]
 pub struct Passes {
     cpu: Renderer,
-    /// Until it is lost.
+    /// `None` on the processor, and after the device was lost.
     gpu: Option<GpuPasses>,
-    /// What was lost, and why.
+    /// Lost device and the reason, until read.
     lost: Option<String>,
 }
 
@@ -32,24 +32,24 @@ impl Default for Passes {
 }
 
 impl Passes {
-    /// Returns those of the processor.
+    /// Returns the passes of the processor.
     pub fn cpu() -> Self {
         Self { cpu: Renderer::default(), gpu: None, lost: None }
     }
 
-    /// Returns those of a graphics adapter.
+    /// Returns the passes of a graphics adapter.
     ///
     /// # Errors
-    /// [`RenderError::Device`] if its device does not open, or compiles no kernels.
+    /// [`RenderError::Device`] if its device does not open or does not compile the kernels.
     pub fn gpu(adapter: &Adapter, budget: Budget) -> Result<Self, RenderError> {
         Ok(Self { gpu: Some(GpuPasses::new(adapter, budget)?), ..Self::cpu() })
     }
 
-    /// Returns those for a machine, and why: of the first graphics adapter that renders a test scene and finds its
-    /// derivatives as the processor does, else of the processor. [`Backend::Auto`] leaves software Vulkan alone.
+    /// Selects a device, and returns the reason: the first graphics adapter whose derivatives of a test scene match the
+    /// processor's, else the processor. [`Backend::Auto`] skips software Vulkan.
     ///
     /// # Errors
-    /// [`NoRenderer::Gpu`] if [`Backend::Gpu`] was asked for and there is none.
+    /// [`NoRenderer::Gpu`] if [`Backend::Gpu`] is requested and no adapter works.
     pub fn choose(backend: Backend) -> Result<(Self, String), NoRenderer> {
         if backend == Backend::Cpu {
             return Ok((Self::cpu(), "asked for".to_owned()));
@@ -58,7 +58,7 @@ impl Passes {
         for adapter in Adapter::all() {
             let AdapterName { name, is_software } = adapter.name();
             if *is_software && backend == Backend::Auto {
-                found.push(format!("software adapter {name} left alone"));
+                found.push(format!("software adapter {name} skipped"));
                 continue;
             }
             let tried = GpuPasses::new(&adapter, Budget::default())
@@ -82,29 +82,29 @@ impl Passes {
         Ok((Self::cpu(), why))
     }
 
-    /// Returns what computes now: `cpu avx2`, or `gpu` and the adapter's name.
+    /// Returns the name of the device in use: `cpu avx2`, or `gpu` and the adapter's name.
     pub fn name(&self) -> &str {
         self.gpu.as_ref().map_or_else(|| self.cpu.name(), GpuPasses::name)
     }
 
-    /// Returns which device was lost and why, once; the processor has taken over then.
+    /// Returns the lost device and the reason, once; from then on the processor renders.
     pub fn take_lost(&mut self) -> Option<String> {
         self.lost.take()
     }
 
-    /// Destroys the device, if there is one, as a driver's reset does: to test what takes over.
+    /// Destroys the device, if any, as a driver reset does: for tests of the fallback.
     pub fn lose_device(&self) {
         if let Some(gpu) = &self.gpu {
             gpu.lose_device();
         }
     }
 
-    /// Returns where a device's time went in all images so far; `None` where none renders.
+    /// Returns the device's time by part, over all images; `None` on the processor.
     pub fn device_times(&self) -> Option<TrainingTimes> {
         self.gpu.as_ref().map(GpuPasses::times)
     }
 
-    /// Renders the image of a view; `changed` is what may differ from the Gaussians of the last one.
+    /// Renders a view. `changed` lists the Gaussians that may differ from the last call.
     pub(crate) fn forward(
         &mut self,
         gaussians: &Gaussians,
@@ -122,8 +122,8 @@ impl Passes {
         }
     }
 
-    /// Takes the derivative of a loss by the last image's channels back: fills `seen` with the rows that it
-    /// shows, ascending, and `out` with as many gradients.
+    /// Propagates a derivative by the last image's channels: fills `seen` with the visible rows, in ascending order,
+    /// and `out` with one gradient each.
     pub(crate) fn backward(
         &mut self,
         gaussians: &Gaussians,
@@ -138,7 +138,7 @@ impl Passes {
                 Ok(()) => return,
                 Err(why) => self.lose(&why),
             }
-            // What the device rendered is gone with it.
+            // The device's image is lost with it.
             self.cpu.forward(gaussians, view, style);
         }
         seen.clear();

@@ -1,26 +1,25 @@
-//! Images of several channels as the passes write and read them: in bands as high as a tile, so that
-//! threads own whole bands, padded to whole tiles.
+//! Images of several channels, stored in bands of one tile's height and padded to whole tiles: each thread owns
+//! complete bands.
 
 /// Side of a tile. [px]
 pub const TILE: usize = 16;
 
-/// Channels of an image, band by band, channel by channel, row by row.
+/// Channels of an image: band by band, channel by channel, row by row.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Planes {
-    /// Channels.
+    /// Number of channels.
     pub channels: usize,
-    /// Width of what counts. [px]
+    /// Width without padding. [px]
     pub width: usize,
-    /// Height of what counts. [px]
+    /// Height without padding. [px]
     pub height: usize,
-    /// Numbers from one row to the next: the width in whole tiles.
+    /// Distance from one row to the next: the width rounded up to whole tiles.
     pub stride: usize,
-    /// All numbers.
     pub values: Vec<f32>,
 }
 
 impl Planes {
-    /// Gives the planes a size; contents are unspecified, but zero where they are new.
+    /// Sets the size. Contents are unspecified; added values are zero.
     pub fn resize(&mut self, channels: usize, width: usize, height: usize) {
         self.channels = channels;
         self.width = width;
@@ -34,12 +33,12 @@ impl Planes {
         self.height.div_ceil(TILE)
     }
 
-    /// Returns the numbers of a band.
+    /// Returns the number of values in a band.
     pub fn band_len(&self) -> usize {
         self.channels * TILE * self.stride
     }
 
-    /// Returns where a row of a channel starts.
+    /// Returns the index of a row's first value.
     fn start(&self, channel: usize, y: usize) -> usize {
         ((y / TILE * self.channels + channel) * TILE + y % TILE) * self.stride
     }
@@ -49,19 +48,19 @@ impl Planes {
         &self.values[self.start(channel, y)..][..self.width]
     }
 
-    /// Returns a row of a channel, to change.
+    /// Returns a mutable row of a channel.
     pub fn row_mut(&mut self, channel: usize, y: usize) -> &mut [f32] {
         let start = self.start(channel, y);
         let width = self.width;
         &mut self.values[start..][..width]
     }
 
-    /// Returns one number.
+    /// Returns one value.
     pub fn at(&self, channel: usize, x: usize, y: usize) -> f32 {
         self.values[self.start(channel, y) + x]
     }
 
-    /// Returns one number, to change.
+    /// Returns one value for writing.
     pub fn at_mut(&mut self, channel: usize, x: usize, y: usize) -> &mut f32 {
         let start = self.start(channel, y);
         &mut self.values[start + x]

@@ -1,11 +1,11 @@
-//! Pass 1: Gaussians onto the image plane, and what a loss feels there back to their parameters.
+//! Pass 1: projects Gaussians onto the image plane, and propagates derivatives from there back to their parameters.
 //!
-//! The same mathematics as `vizflyt-splat`'s (Kerbl et al. 2023, with the linearisation clamped beside
-//! the image), in its form: alpha at `(x, y)` is `2^(level - falloff_x (dx - shear dy)^2 - falloff_y
-//! dy^2)`, which cannot turn negative, and whose determinant comes from minors, so that it cannot
-//! cancel. [`Flat::backward`] is the derivative of [`Flat::of`], line by line from the end.
+//! The mathematics is that of `vizflyt-splat` (Kerbl et al. 2023, with the linearisation clamped outside the image).
+//! Alpha at `(x, y)` is `2^(level - falloff_x (dx - shear dy)^2 - falloff_y dy^2)`: this form cannot become negative,
+//! and its determinant is computed from minors, so it cannot cancel. [`Flat::backward`] is the derivative of
+//! [`Flat::of`], line by line from the end.
 //!
-//! Budget: some 60 ns a Gaussian ahead of the camera, 150 ns back.
+//! Budget: about 60 ns per Gaussian in front of the camera, and 150 ns for its derivative.
 
 use glam::{Mat3, Quat, Vec3};
 use vizflyt_splat::harmonics::{C0, C1, C2, C3};
@@ -14,24 +14,24 @@ use vizflyt_splat::limits::{BLUR_PX2, MAX_SCALE_M};
 use crate::gaussians::{coefficients, column};
 use crate::view::View;
 
-/// log2(1/255): below this level nothing is seen.
+/// log2(1/255): minimum visible level.
 pub(crate) const MIN_LEVEL: f32 = -7.994_353_5;
 const HALF_LOG2_E: f32 = std::f32::consts::LOG2_E / 2.0;
 const BLUR: f32 = BLUR_PX2 as f32;
-/// The least share of its opacity that a Gaussian much smaller than a pixel keeps (anti-aliased).
+/// Square of the minimum opacity factor of Gaussians much smaller than a pixel (anti-aliased).
 const MIN_COMPENSATION2: f32 = 1e-8;
 
-/// How Gaussians are rendered.
+/// Rendering options.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Style {
-    /// Degree of the harmonics that count, at most that of the rows.
+    /// Degree of the harmonics used; at most that of the rows.
     pub degree: u8,
-    /// Whether what is blurred to the size of a pixel is dimmed by as much (Yu et al. 2024,
-    /// "Mip-Splatting", equation 11).
+    /// Dims Gaussians that are blurred to the size of a pixel by the same factor (Yu et al. 2024, "Mip-Splatting",
+    /// equation 11).
     pub antialiased: bool,
 }
 
-/// A Gaussian on the image plane.
+/// A Gaussian projected onto the image plane.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Flat {
     pub(crate) mean: [f32; 2],
@@ -39,17 +39,17 @@ pub(crate) struct Flat {
     pub(crate) falloff: [f32; 2],
     /// log2 of the opacity.
     pub(crate) level: f32,
-    /// Half the box of alpha >= 1/255. [px]
+    /// Half size of the bounding box of alpha >= 1/255. [px]
     pub(crate) extent: [f32; 2],
     /// dy of the rightmost point of that ellipse. [px]
     pub(crate) tip_y: f32,
     pub(crate) z: f32,
     pub(crate) rgb: [f32; 3],
-    /// Its row.
+    /// Index of the row.
     pub(crate) index: u32,
 }
 
-/// The derivative of a loss by the numbers of a [`Flat`].
+/// Derivative of a loss by the fields of a [`Flat`].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct FlatGradient {
     pub(crate) mean: [f32; 2],
@@ -60,23 +60,22 @@ pub(crate) struct FlatGradient {
     pub(crate) rgb: [f32; 3],
 }
 
-/// The derivative of a loss by a row: geometry, then the harmonics as the product of `basis` and
-/// `rgb`.
+/// Derivative of a loss by a row: geometry; harmonics as the product of `basis` and `rgb`.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct RowGradient {
     pub(crate) geometry: [f32; column::SH],
     pub(crate) basis: [f32; 16],
     pub(crate) rgb: [f32; 3],
-    /// The error of the image that is seen through it; no derivative, but where more are needed.
+    /// Image error seen through the Gaussian. Not a derivative: it shows where more Gaussians are needed.
     pub(crate) error: f32,
 }
 
-/// What both directions compute.
+/// Values that both directions compute.
 struct Projection {
-    /// From the camera, in the world and along its axes.
+    /// Offset from the camera in world axes, and its depth.
     d: Vec3,
     z: f32,
-    /// Slopes, and where the projection is linearised.
+    /// Slopes, and the slopes at which the projection is linearised.
     slope: [f32; 2],
     at: [f32; 2],
     /// Rows of J W.
@@ -90,7 +89,7 @@ struct Projection {
     uu: f32,
     b: f32,
     vv: f32,
-    /// Of the covariance without and with blur.
+    /// Determinant of the covariance without and with blur.
     bare: f32,
     determinant: f32,
 }
@@ -125,7 +124,7 @@ impl Projection {
 }
 
 impl Flat {
-    /// Returns row `index` as the view sees it; `None` if it does not.
+    /// Projects row `index`; returns `None` if the view does not see it.
     #[inline(always)]
     pub(crate) fn of(row: &[f32], index: u32, view: &View, style: Style) -> Option<Self> {
         let p = Projection::of(row, view)?;
@@ -138,7 +137,7 @@ impl Flat {
         let extent = [(reach2 * a).sqrt(), (reach2 * c).sqrt()];
         let mean: [f32; 2] = std::array::from_fn(|k| view.focal[k] * p.slope[k] + view.center[k]);
         let size = [view.width as f32, view.height as f32];
-        // Positive, so that NaN is not seen: some pixel's centre lies in the box.
+        // Positive condition, so that NaN counts as unseen: some pixel's centre lies in the box.
         let seen = |k: usize| {
             mean[k] + extent[k] > 0.5 && mean[k] - extent[k] < size[k] - 0.5 && extent[k] < 1e18
         };
@@ -161,7 +160,7 @@ impl Flat {
         })
     }
 
-    /// Returns what a gradient on the image plane is by the row's numbers.
+    /// Returns the derivative by the row's values from that on the image plane.
     #[inline(always)]
     pub(crate) fn backward(
         row: &[f32],
@@ -220,7 +219,7 @@ impl Flat {
         }
         by_d += view.rows[2] * by_z;
 
-        // Colour, where it is not cut off at 0, and the direction it is seen along.
+        // Colour, if not clamped at 0, and the viewing direction.
         let distance = p.d.length();
         let direction = p.d / distance;
         let basis = basis(direction, style.degree);
@@ -236,7 +235,7 @@ impl Flat {
     }
 }
 
-/// Returns the derivative by a quaternion of any length, from that by the columns of its rotation.
+/// Returns the derivative by an unnormalised quaternion, from that by the columns of its rotation.
 #[inline(always)]
 fn by_quaternion(q: &[f32], columns: [Vec3; 3]) -> [f32; 4] {
     let length = (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]).sqrt();
@@ -249,13 +248,13 @@ fn by_quaternion(q: &[f32], columns: [Vec3; 3]) -> [f32; 4] {
         2.0 * (x * (m2.x + m0.z) + y * (m2.y + m1.z) - 2.0 * z * (m0.x + m1.y) + w * (m0.y - m1.x)),
         2.0 * (x * (m1.z - m2.y) + y * (m2.x - m0.z) + z * (m0.y - m1.x)),
     ];
-    // Only what is across q: its length does not turn.
+    // Only the part perpendicular to q: its length does not rotate anything.
     let along = by[0] * x + by[1] * y + by[2] * z + by[3] * w;
     let unit = [x, y, z, w];
     std::array::from_fn(|k| (by[k] - along * unit[k]) / length)
 }
 
-/// Returns colours before they are cut off at 0.
+/// Returns colours before they are clamped at 0.
 #[inline(always)]
 fn colour(sh: &[f32], basis: &[f32; 16], degree: u8) -> [f32; 3] {
     let mut rgb = [0.5; 3];

@@ -1,8 +1,8 @@
-//! Random numbers that a seed and a counter determine, the same on every machine.
+//! Random numbers determined by a seed and a counter: equal on every machine.
 
 use vizflyt_protocol::random::{self, SplitMix64};
 
-/// A stream of numbers.
+/// A stream of random numbers.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Random(SplitMix64);
 
@@ -12,12 +12,12 @@ impl Random {
         Self(SplitMix64::new(seed))
     }
 
-    /// Returns stream `i` of a seed: streams of neighbours are independent.
+    /// Returns stream `i` of a seed. Streams with adjacent indices are independent.
     pub fn stream(seed: u64, i: u64) -> Self {
         Self::new(random::nth(seed ^ i.wrapping_mul(0xd1342543de82ef95), 0))
     }
 
-    /// Returns the seed of the numbers still to come.
+    /// Returns the seed of the remaining numbers.
     pub(crate) fn state(&self) -> u64 {
         self.0.state()
     }
@@ -48,7 +48,7 @@ impl Random {
         radius * (std::f32::consts::TAU * self.unit()).cos()
     }
 
-    /// Puts a list into random order.
+    /// Shuffles a list.
     pub fn shuffle<T>(&mut self, list: &mut [T]) {
         for i in (1..list.len()).rev() {
             list.swap(i, self.below(i + 1));

@@ -1,5 +1,5 @@
-//! The plain truth of the passes: f64, one pixel after the other, no tiles. Derivatives are held
-//! against its finite differences.
+//! Reference implementation of the passes: f64, pixel by pixel, without tiles. Tests compare derivatives with its
+//! finite differences.
 
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use vizflyt_splat::harmonics;
@@ -10,8 +10,7 @@ use crate::project::Style;
 use crate::render::channel;
 use crate::view::View;
 
-/// Returns the channels of every pixel, row by row, of rows of parameters as a view sees them; see
-/// [`channel`] for the channels.
+/// Renders rows of parameters. Returns the channels of every pixel, row by row; see [`channel`].
 pub fn render(
     rows: &[f64],
     stride: usize,

@@ -1,12 +1,14 @@
-//! Where Gaussians are needed: those that died go where the image is wrong, and their number grows to a
-//! budget.
+//! Relocation and growth: dead Gaussians move to where the image is wrong, and the number grows up to a maximum.
 //!
-//! As in Kheradmand et al. 2024 ("3D Gaussian Splatting as Markov Chain Monte Carlo") nothing is
-//! cloned or pruned by thresholds: the dead are drawn to the living, and the faint wander by noise
-//! shaped as they are (equation 8 there), so that they find work. Drawn by the error that is seen through each (Rota
-//! Bulo et al. 2024, "Revising Densification"), not by opacity: a floor without corners begins with few,
-//! large ones. And halved across their longest axis, not stacked in one place: a surface stays one opaque layer,
-//! which is what a referee bakes.
+//! As in Kheradmand et al. 2024 ("3D Gaussian Splatting as Markov Chain Monte Carlo"), no thresholds clone or prune
+//! Gaussians. Dead ones move to living ones, and faint ones move by noise of their own shape (equation 8 there) until
+//! they become useful.
+//!
+//! Two differences:
+//! - Targets are drawn by the error seen through each Gaussian (Rota Bulo et al. 2024, "Revising Densification"), not
+//!   by opacity: a floor without corners begins with few, large Gaussians.
+//! - Gaussians are halved across their longest axis instead of stacked in one place: a surface remains one opaque
+//!   layer, as baking into obstacles requires.
 
 use glam::{Mat3, Quat, Vec3};
 
@@ -14,11 +16,11 @@ use crate::adam::Moments;
 use crate::gaussians::{Gaussians, column, logit, sigmoid};
 use crate::random::Random;
 
-/// Fainter is dead.
+/// Maximum opacity of a dead Gaussian.
 const DEAD_OPACITY: f32 = 0.005;
 
-/// Moves the dead to where `errors`, one a row, are, and adds up to `grow` more; returns how many were
-/// dead.
+/// Moves dead Gaussians to where `errors` (one per row) are large, and adds up to `grow` more. Returns the number of
+/// dead ones.
 pub(crate) fn relocate(
     gaussians: &mut Gaussians,
     moments: &mut Moments,
@@ -29,7 +31,7 @@ pub(crate) fn relocate(
     let count = gaussians.len();
     let is_dead = |i: usize| !(sigmoid(gaussians.row(i)[column::LOGIT]) > DEAD_OPACITY);
     let dead: Vec<bool> = (0..count).map(is_dead).collect();
-    // Running sums, to draw the living by their error.
+    // Cumulative sums, to draw living Gaussians by their error.
     let mut sum = 0.0;
     let sums: Vec<f64> = (0..count)
         .map(|i| {
@@ -63,7 +65,7 @@ pub(crate) fn relocate(
     died
 }
 
-/// Makes a row one half of what it was across its longest axis, and returns the other.
+/// Replaces a row by one half of it across its longest axis, and returns the other half.
 fn halve(row: &mut [f32]) -> Vec<f32> {
     let logs = &row[column::LOG_SCALE..column::ROTATION];
     let longest = (0..3).max_by(|&a, &b| logs[a].total_cmp(&logs[b])).unwrap_or(0);
@@ -82,18 +84,19 @@ fn halve(row: &mut [f32]) -> Vec<f32> {
     half
 }
 
-/// Of a half, in standard deviations of the whole: how far from its middle, how long, how wide; and its
-/// opacity in that of the whole. The two look like the one within a quarter of its peak everywhere.
+/// Offset, length and width of a half, in standard deviations of the whole, and its opacity relative to the whole. The
+/// halves together differ from the whole by less than a quarter of its peak everywhere.
 const OFFSET: f32 = 0.65;
 const LENGTH: f32 = 0.6;
 const WIDTH: f32 = 0.95;
 const OPACITY: f32 = 0.95;
 
-/// Moves faint rows of `seen`, which ascend, by noise of their own shape, `strength` times their covariance.
+/// Moves the faint rows among `seen` (in ascending order) by noise of their own shape, `strength` times their
+/// covariance.
 pub(crate) fn wander(gaussians: &mut Gaussians, seen: &[u32], strength: f32, seed: u64) {
     gaussians.change(seen, |row, values| {
         let opacity = sigmoid(values[column::LOGIT]);
-        // A step at 0.005; what is well visible stays.
+        // A smooth step at 0.005: visible Gaussians stay.
         let faint = sigmoid(-100.0 * (opacity - DEAD_OPACITY));
         if faint < 1e-4 {
             return;
@@ -123,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dead_move_to_where_errors_are_and_new_ones_come() {
+    fn moves_dead_gaussians_to_errors_and_adds_new_ones() {
         let mut gaussians = some();
         let mut moments = Moments::of(&gaussians);
         moments.first.values.fill(1.0);
@@ -133,14 +136,14 @@ mod tests {
         assert_eq!(errors, [0.0; 9]);
         for i in 0..9 {
             let row = gaussians.row(i);
-            // The only one that is seen to be wrong and lives.
+            // The only living Gaussian with a large error, or its halves.
             assert!(row[0] == 1.0 || (row[0] - 3.0).abs() < 0.3, "{}", row[0]);
             assert!(sigmoid(row[column::LOGIT]) > DEAD_OPACITY);
         }
     }
 
     #[test]
-    fn halves_look_like_the_whole() {
+    fn halves_together_look_like_the_whole() {
         for opacity in [0.3f32, 0.6, 0.95] {
             let mut gaussians = Gaussians::new(0);
             gaussians.push(Vec3::ZERO, Vec3::new(0.2, 1.0, 0.1), Quat::IDENTITY, opacity, [0.5; 3]);
@@ -163,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_alive_is_no_panic() {
+    fn does_not_panic_if_all_gaussians_are_dead() {
         let mut gaussians = some();
         for i in 0..4 {
             gaussians.row_mut(i)[column::LOGIT] = f32::NAN;
@@ -175,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn the_faint_wander_and_the_visible_stay() {
+    fn moves_only_faint_gaussians() {
         let mut gaussians = some();
         wander(&mut gaussians, &[0, 1, 3], 1.0, 9);
         let x = |i: usize| gaussians.row(i)[0];

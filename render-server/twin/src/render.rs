@@ -1,6 +1,6 @@
-//! The passes in order, forward and backward, with the buffers between them.
+//! Runs the passes in order, forward and backward, with the buffers between them.
 //!
-//! Every sum has one order, whichever thread computes it: results do not depend on how many there are.
+//! Every sum has a fixed order, so results do not depend on the number of threads.
 
 use rayon::prelude::*;
 use vizflyt_splat::simd::{InstructionSet, Kernel, Simd};
@@ -20,21 +20,21 @@ pub mod channel {
     pub const FIRST: usize = 3;
     /// `sum w z^2`.
     pub const SECOND: usize = 4;
-    /// What passes all Gaussians, 0 to 1.
+    /// Share of light that passes all Gaussians, 0 to 1.
     pub const TRANSMITTANCE: usize = 5;
-    /// How many there are.
+    /// Number of channels of an image.
     pub const COUNT: usize = super::CHANNELS;
-    /// Of the derivative alone: how wrong a pixel is.
+    /// Weight of a pixel's error; only in derivatives.
     pub const ERROR: usize = COUNT;
-    /// How many a derivative has.
+    /// Number of channels of a derivative.
     pub const BY_COUNT: usize = super::BY_CHANNELS;
 }
 
-/// Renders Gaussians and takes derivatives back to them; keeps its buffers from image to image.
+/// Renders Gaussians and propagates derivatives back to them. Buffers are reused between images.
 #[derive(Debug)]
 pub struct Renderer {
     instructions: InstructionSet,
-    /// Of the image rendered last.
+    /// Gaussians of the last image.
     flats: Vec<Flat>,
     chunks: Vec<Vec<Flat>>,
     bins: Bins,
@@ -69,7 +69,7 @@ impl Renderer {
         self.instructions.name()
     }
 
-    /// Renders the image of a view; its channels are [`channel`]'s.
+    /// Renders a view. The channels are those of [`channel`].
     pub fn forward(&mut self, gaussians: &Gaussians, view: &View, style: Style) -> &Planes {
         let instructions = self.instructions;
         let stride = gaussians.stride();
@@ -102,7 +102,7 @@ impl Renderer {
         &self.image
     }
 
-    /// Returns the rows that the last image shows, in ascending order.
+    /// Returns the rows visible in the last image, in ascending order.
     pub fn seen(&self) -> impl ExactSizeIterator<Item = usize> + '_ {
         self.flats.iter().map(|flat| flat.index as usize)
     }
@@ -112,7 +112,7 @@ impl Renderer {
         self.bins.entries.len()
     }
 
-    /// Takes the derivative of a loss by the last image's channels back to the rows it shows.
+    /// Propagates a derivative by the last image's channels back to the visible rows.
     pub(crate) fn backward(
         &mut self,
         gaussians: &Gaussians,
@@ -126,7 +126,7 @@ impl Renderer {
         let (flats, bins) = (&self.flats[..], &self.bins);
         self.pairs.resize(bins.entries.len(), [0.0; SUMS]);
         let (len, stride) = (self.image.band_len(), self.image.stride);
-        // Each band's pairs stand next to each other.
+        // The pairs of a band are contiguous.
         let mut bands = Vec::with_capacity(self.image.bands());
         let mut rest = &mut self.pairs[..];
         for band in 0..self.image.bands() {
@@ -188,7 +188,7 @@ impl Kernel for Project<'_> {
     }
 }
 
-/// Gathers the pairs of a chunk of flat Gaussians and takes them back to their rows.
+/// Sums the pairs of a chunk of projected Gaussians and propagates them back to their rows.
 struct Unproject<'a> {
     gaussians: &'a Gaussians,
     view: &'a View,

@@ -1,30 +1,30 @@
-//! Surfaces without texture are flat: a toll on how inverse depth bends along rows and columns, less where
-//! the photo has an edge.
+//! Smoothness loss for surfaces without texture: penalises the second difference of inverse depth along rows and
+//! columns, less at edges of the photo.
 //!
-//! The inverse depth of a plane is affine in the pixel, so that planes, however inclined, cost nothing.
+//! The inverse depth of a plane is affine in the pixel, so planes of any inclination cost nothing.
 
 use rayon::prelude::*;
 
 use crate::planes::{Planes, TILE};
 use crate::render::channel;
 
-/// Bends up to here count by their square, more by their size. [shares of the mean inverse depth]
+/// Limit between quadratic and linear penalty (Huber) [fraction of the mean inverse depth].
 const SMALL: f32 = 0.01;
-/// Rays with less on them have no depth.
+/// Minimum alpha of a pixel with a depth.
 const MIN_ALPHA: f32 = 0.1;
-/// An edge of a photo by which the toll falls to a third. [1 is white]
+/// Edge strength of the photo at which the penalty falls to 1/e [1 is white].
 const EDGE: f32 = 0.1;
 
-/// Memory to work in.
+/// Reusable buffers.
 #[derive(Debug, Default)]
 pub(crate) struct Scratch {
-    /// Inverse depth; NaN where there is none.
+    /// Inverse depth; NaN if undefined.
     inverse: Planes,
-    /// By which tolls grow with the bend at a pixel: across, down.
+    /// Derivative of the penalty by the second difference at a pixel: across, down.
     slopes: Planes,
 }
 
-/// Adds the derivative of `weight` times the mean bend to `by`; returns that mean. `truth` is the photo.
+/// Adds the derivative of `weight` times the mean penalty to `by`; returns that mean. `truth` is the photo.
 pub(crate) fn add(
     image: &Planes,
     truth: &Planes,
@@ -71,7 +71,7 @@ pub(crate) fn add(
     tolls.iter().sum::<f64>() / (width * height) as f64
 }
 
-/// Fills the inverse depths; returns their sum, and how many there are.
+/// Fills the inverse depths; returns their sum and their number.
 fn invert(image: &Planes, inverse: &mut Planes) -> (f64, u32) {
     let (width, height) = (image.width, image.height);
     inverse.resize(1, width, height);
@@ -103,20 +103,20 @@ fn invert(image: &Planes, inverse: &mut Planes) -> (f64, u32) {
     sums.iter().fold((0.0, 0), |(sum, count), band| (sum + band.0, count + band.1))
 }
 
-/// Returns a row of a channel without its ends: what is before each pixel, the pixel, what is behind it.
+/// Returns three views of a row, without its ends: the previous pixel, the pixel, the next pixel.
 fn beside(plane: &Planes, channel: usize, y: usize) -> [&[f32]; 3] {
     let row = plane.row(channel, y);
     let len = row.len() - 2;
     [&row[..len], &row[1..=len], &row[2..]]
 }
 
-/// Returns a row of a channel likewise with the rows above and below it.
+/// Returns a row of a channel with the rows above and below it: above, the row, below.
 fn around(plane: &Planes, channel: usize, y: usize) -> [&[f32]; 3] {
     [plane.row(channel, y - 1), plane.row(channel, y), plane.row(channel, y + 1)]
 }
 
-/// Writes by which the tolls of a row grow with its bends, 0 where there are none, and returns the tolls' sum.
-/// Inverse depths and each colour are those before each pixel, at it, and behind it.
+/// Writes the derivative of the penalty by each second difference of a row (0 if undefined); returns the sum of the
+/// penalties. Inverse depths and colours are those before, at and after each pixel.
 fn bends(inverse: [&[f32]; 3], shades: [[&[f32]; 3]; 3], scale: f32, slopes: &mut [f32]) -> f64 {
     let mut total = 0.0;
     for (x, slope) in slopes.iter_mut().enumerate() {
@@ -134,7 +134,7 @@ fn bends(inverse: [&[f32]; 3], shades: [[&[f32]; 3]; 3], scale: f32, slopes: &mu
             })
             .sum();
         let weight = (-edge / (3.0 * EDGE)).exp();
-        // Huber's.
+        // Huber loss.
         let size = bend.abs();
         let toll = if size < SMALL { bend * bend / (2.0 * SMALL) } else { size - SMALL / 2.0 };
         total += f64::from(weight * toll);
@@ -143,7 +143,7 @@ fn bends(inverse: [&[f32]; 3], shades: [[&[f32]; 3]; 3], scale: f32, slopes: &mu
     total
 }
 
-/// Adds the derivative of `share` times the sum of all tolls, by way of the inverse depths.
+/// Adds the derivative of `share` times the sum of all penalties, through the inverse depths.
 fn take_back(image: &Planes, scratch: &Scratch, share: f32, by: &mut Planes) {
     let Scratch { inverse, slopes } = scratch;
     let (width, height) = (image.width, image.height);

@@ -1,33 +1,31 @@
-//! Structural similarity of two images, and its derivative (Wang et al. 2004, "Image quality
-//! assessment", with their Gaussian window of 11 pixels and sigma 1.5; nothing lies beyond the border,
-//! as in the trainers).
+//! Structural similarity of two images, and its derivative (Wang et al. 2004, "Image quality assessment", with their
+//! Gaussian window of 11 pixels and sigma 1.5; zero beyond the border, as in other trainers).
 //!
-//! A band at a time: five sums over windows, across then down; then three maps of derivatives, blurred
-//! by the same window, which is its own mirror image. Some 12 ns a pixel and channel.
+//! The computation runs band by band: five window sums, across then down; then three maps of derivatives, blurred by
+//! the same window, which is symmetric. It takes about 12 ns per pixel and channel.
 
 use rayon::prelude::*;
 use vizflyt_splat::simd::{InstructionSet, Kernel, Simd};
 
 use crate::planes::{Planes, TILE};
 
-/// Pixels of the window to each side.
+/// Radius of the window without its centre. [px]
 const REACH: usize = 5;
 const ROWS: usize = TILE + 2 * REACH;
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
-/// Longest vector.
+/// Maximum vector length.
 const MAX_LANES: usize = 16;
 
-/// Returns half of the window, from its centre; the whole sums up to 1.
+/// Returns half of the window, from its centre; the complete window sums to 1.
 fn window() -> [f32; REACH + 1] {
     let bell = |k: usize| (-((k * k) as f32) / (2.0 * 1.5 * 1.5)).exp();
     let sum = bell(0) + 2.0 * (1..=REACH).map(bell).sum::<f32>();
     std::array::from_fn(|k| bell(k) / sum)
 }
 
-/// Writes the derivatives of the sum of similarities over all pixels and channels by the window sums
-/// of `shown`, `shown^2` and `shown truth` (three channels for each channel) to `maps`; returns the
-/// sum itself.
+/// Writes the derivatives of the sum of similarities (over all pixels and channels) by the window sums of `shown`,
+/// `shown^2` and `shown truth` to `maps`, three maps for each channel. Returns the sum of similarities.
 pub(crate) fn similarity(
     instructions: InstructionSet,
     shown: &Planes,
@@ -46,7 +44,7 @@ pub(crate) fn similarity(
     sums.iter().sum()
 }
 
-/// Writes the derivative of the sum of similarities by every number of `shown`, from its maps.
+/// Writes the derivative of the sum of similarities by every value of `shown`, from its maps.
 pub(crate) fn derivative(
     instructions: InstructionSet,
     shown: &Planes,
@@ -61,7 +59,7 @@ pub(crate) fn derivative(
     });
 }
 
-/// Rows of a band and its surroundings, blurred across; a sum or product of images each.
+/// Rows of a band and its surroundings, blurred across; one map for each sum or product of images.
 struct Strip<const N: usize> {
     stride: usize,
     padded: Vec<f32>,
@@ -77,7 +75,7 @@ impl<const N: usize> Strip<N> {
         }
     }
 
-    /// Blurs row `row` of the strip across, of what `value` says for each pixel.
+    /// Blurs row `row` of the strip across. `value` returns each pixel's value.
     #[inline(always)]
     fn across<S: Simd>(
         &mut self,
@@ -103,14 +101,14 @@ impl<const N: usize> Strip<N> {
         }
     }
 
-    /// Empties a row of the strip, which lies beyond the image.
+    /// Clears a row of the strip that lies outside the image.
     fn clear(&mut self, row: usize) {
         for map in 0..N {
             self.rows[(map * ROWS + row) * self.stride..][..self.stride].fill(0.0);
         }
     }
 
-    /// Blurs down: returns the window's sum at a pixel of row `row` of the band.
+    /// Blurs down: returns the window sum at a pixel of row `row` of the band.
     #[inline(always)]
     fn down<S: Simd>(&self, s: S, map: usize, row: usize, x: usize) -> S::F {
         let window = window();
@@ -122,7 +120,7 @@ impl<const N: usize> Strip<N> {
         sum
     }
 
-    /// Calls `fill` with the rows of the strip that lie in the image: place in the strip, y.
+    /// Calls `fill` with each row of the strip inside the image: index in the strip, y.
     #[inline(always)]
     fn fill(&mut self, band: usize, height: usize, mut fill: impl FnMut(&mut Self, usize, usize)) {
         for row in 0..ROWS {
@@ -174,7 +172,7 @@ impl Kernel for Similarity<'_> {
                     let by_product = one / (brightness * variance);
                     let similar = means * covariance * by_product;
                     s.store(similar, &mut values[x..]);
-                    // By the sums of a, a^2 and a b; variances hold a^2 and a b less their means'.
+                    // By the sums of a, a^2 and a b; variances are a^2 and a b minus the products of the means.
                     let by_mean = two * mb * (covariance - means) * by_product
                         + two * ma * similar * (one / variance - one / brightness);
                     let by_square = s.splat(0.0) - similar / variance;
@@ -237,7 +235,7 @@ mod tests {
     use super::*;
     use crate::random::Random;
 
-    /// The definition, window by window.
+    /// Computes the definition, window by window.
     fn plain(a: &[f64], b: &[f64], width: i32, height: i32) -> f64 {
         let weight = |d: i32| f64::from(window()[d.unsigned_abs() as usize]);
         let mut total = 0.0;
@@ -267,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn sum_and_derivative_are_those_of_the_definition() {
+    fn sum_and_derivative_match_the_definition() {
         let (width, height) = (37, 19);
         let mut random = Random::new(4);
         let (mut shown, mut truth) = (Planes::default(), Planes::default());

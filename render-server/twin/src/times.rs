@@ -1,4 +1,4 @@
-//! Where the time of a training goes, part by part.
+//! Training time by part.
 
 use std::fmt;
 use std::time::Instant;
@@ -6,28 +6,28 @@ use std::time::Instant;
 use serde::Serialize;
 use vizflyt_splat::gpu::training::TrainingTimes;
 
-/// How long the parts of a step took, on average of all steps. [ms]
+/// Mean time of each part of a training step [ms].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Times {
-    /// The photo's rendering.
+    /// Rendering of the photo's view.
     pub forward: f64,
-    /// Its loss, and the derivative by the rendering.
+    /// Loss and its derivative with respect to the rendering.
     pub loss: f64,
-    /// The derivative back to the Gaussians.
+    /// Derivative with respect to the Gaussians.
     pub backward: f64,
-    /// The optimiser.
+    /// Optimiser step.
     pub adam: f64,
-    /// Noise of the faint.
+    /// Noise on the means of faint Gaussians.
     pub wander: f64,
-    /// The dead to where they are needed.
+    /// Relocation of dead Gaussians.
     pub relocate: f64,
-    /// Of `forward` and `backward`, what a graphics card and the bus to it took; absent on the processor.
+    /// Share of `forward` and `backward` on a graphics card and its bus; absent on the processor.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub device: Option<TrainingTimes>,
 }
 
 impl Times {
-    /// Returns the mean of what was added up over so many steps.
+    /// Returns the mean of sums over a number of steps.
     pub(crate) fn mean(&self, steps: u32) -> Self {
         let share = 1.0 / f64::from(steps.max(1));
         Self {
@@ -42,7 +42,7 @@ impl Times {
     }
 }
 
-/// Adds what has passed since an instant, which then is now. [ms]
+/// Adds the time since an instant to a sum [ms], and sets the instant to the present.
 pub(crate) fn lap(to: &mut f64, since: &mut Instant) {
     let now = Instant::now();
     *to += (now - *since).as_secs_f64() * 1e3;

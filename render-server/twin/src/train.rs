@@ -1,8 +1,8 @@
-//! The schedule of a training: which photo, which step sizes, when Gaussians move and multiply.
+//! Training schedule: photo order, learning rates, and relocation and growth of the Gaussians.
 //!
-//! One step: a photo that is not held out is drawn, rendered on a random background (so that no wall
-//! stays translucent), compared, and every Gaussian it shows moves once. The same dataset, options and
-//! kind of processor give the same twin, whatever the number of threads.
+//! One step: a photo that is not held out is drawn, rendered on a random background (so that walls become opaque) and
+//! compared, and every visible Gaussian is updated once. The same dataset, options and kind of processor give the same
+//! twin, for any number of threads.
 
 mod checkpoint;
 mod start;
@@ -26,26 +26,27 @@ use crate::random::Random;
 use crate::relocate::{relocate, wander};
 use crate::times::{Times, lap};
 
-/// How to train.
+/// Training options.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
-    /// Steps, one photo each.
+    /// Number of steps; each trains with one photo.
     pub steps: u32,
-    /// The most Gaussians.
+    /// Maximum number of Gaussians.
     pub splats: usize,
     /// Degree of the harmonics, 0 to 3.
     pub degree: u8,
-    /// Same seed, same twin.
+    /// Random seed: the same seed gives the same twin.
     pub seed: u64,
-    /// Every how many-th photo is held out to be judged by, from the first; 0: none is.
+    /// Interval of held-out photos, starting with the first: `8` holds out every eighth photo for evaluation; 0 holds
+    /// out none.
     pub hold_out: usize,
-    /// Whether to train for a renderer that dims what is smaller than a pixel.
+    /// Train for a renderer that dims splats smaller than a pixel.
     pub antialiased: bool,
-    /// Whether photos differ in brightness and colour.
+    /// Estimate the brightness and colour of each photo.
     pub exposure: bool,
-    /// What counts how much.
+    /// Weights of the parts of the loss.
     pub weights: Weights,
-    /// What every Gaussian pays.
+    /// Regularisation weights.
     pub tolls: Tolls,
 }
 
@@ -65,7 +66,7 @@ impl Default for Options {
     }
 }
 
-/// A training under way.
+/// A running training.
 #[derive(Debug)]
 pub struct Trainer<'a> {
     dataset: &'a Dataset,
@@ -78,20 +79,20 @@ pub struct Trainer<'a> {
     loss: Loss,
     gradients: Vec<RowGradient>,
     seen: Vec<u32>,
-    /// How many numbers of each row in `seen` are others than at the last rendering; `None`: any of any row.
+    /// Number of values per row in `seen` that changed since the last rendering; `None`: any value of any row.
     stale: Option<usize>,
-    /// Error seen through each Gaussian since they last moved house.
+    /// Error seen through each Gaussian since the last relocation.
     errors: Vec<f32>,
-    /// Photos still to come before all are shuffled again.
+    /// Photos left in this shuffled pass over the dataset.
     queue: Vec<usize>,
     random: Random,
     step: u32,
-    /// Of the steps after this one, all together.
+    /// Step after which `times` counts; `times` holds sums.
     timed_from: u32,
     times: Times,
 }
 
-/// A photo's exposure and its moments, gain then offset.
+/// Exposure of a photo and its moments: gain, then offset.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct ExposureState {
     exposure: Exposure,
@@ -100,41 +101,41 @@ struct ExposureState {
     steps: i32,
 }
 
-/// What held-out photos say.
+/// Image quality of the held-out photos.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Quality {
-    /// Photos held out.
+    /// Number of held-out photos.
     pub photos: usize,
     /// Mean peak signal-to-noise ratio. [dB]
     pub psnr_db: f64,
-    /// Mean structural similarity, to 1.
+    /// Mean structural similarity; at most 1.
     pub ssim: f64,
 }
 
-/// A photo beside its rendering.
+/// Comparison of a photo with its rendering.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Comparison {
     /// Peak signal-to-noise ratio. [dB]
     pub psnr_db: f64,
-    /// Structural similarity, to 1.
+    /// Structural similarity; at most 1.
     pub ssim: f64,
-    /// The rendering in the photo's size, H x W x 3, sRGB.
+    /// Rendering at the photo's size, H x W x 3, sRGB.
     pub rgb: Vec<u8>,
 }
 
 impl<'a> Trainer<'a> {
-    /// Begins a training on the processor.
+    /// Starts a training on the processor.
     ///
     /// # Panics
-    /// If the dataset has no photo, or all are held out.
+    /// If the dataset has no photo, or all photos are held out.
     pub fn new(dataset: &'a Dataset, options: Options) -> Self {
         Self::with(dataset, options, Passes::cpu())
     }
 
-    /// Begins a training on what renders and takes derivatives back.
+    /// Starts a training on a device.
     ///
     /// # Panics
-    /// If the dataset has no photo, or all are held out.
+    /// If the dataset has no photo, or all photos are held out.
     pub fn with(dataset: &'a Dataset, options: Options, passes: Passes) -> Self {
         let extent = dataset.extent();
         let gaussians = start::gaussians(dataset, &options, extent);
@@ -161,28 +162,27 @@ impl<'a> Trainer<'a> {
         trainer
     }
 
-    /// Returns the steps done.
+    /// Returns the number of completed steps.
     pub fn steps(&self) -> u32 {
         self.step
     }
 
-    /// Returns what renders and takes derivatives back.
+    /// Returns the device's passes.
     pub fn passes(&mut self) -> &mut Passes {
         &mut self.passes
     }
 
-    /// Returns how long the parts of a step took, on average of those taken here.
+    /// Returns the mean time of each part of a step, over the steps of this process.
     pub fn times(&self) -> Times {
         let device = self.passes.device_times();
         Times { device, ..self.times }.mean(self.step - self.timed_from)
     }
 
-    /// Returns what is trained.
     pub fn gaussians(&self) -> &Gaussians {
         &self.gaussians
     }
 
-    /// Returns the twin as it is now; what nobody could see is left out.
+    /// Returns the twin in its present state, without invisible splats.
     pub fn splats(&self) -> Splats {
         let mut splats = self.gaussians.to_splats();
         let visible: Vec<bool> = splats.opacities.iter().map(|&o| o >= 1.0 / 255.0).collect();
@@ -196,7 +196,7 @@ impl<'a> Trainer<'a> {
         splats
     }
 
-    /// Takes one step; returns the parts of the loss before it.
+    /// Runs one step; returns the parts of the loss before it.
     pub fn step(&mut self) -> Parts {
         let mut start = Instant::now();
         let photo = self.draw();
@@ -247,8 +247,8 @@ impl<'a> Trainer<'a> {
         parts
     }
 
-    /// Returns how well held-out photos are rendered, each exposed as fits it best; `None` if none is
-    /// held out.
+    /// Returns the mean quality of the held-out photos, each with its best-fitting exposure; `None` if no photo is held
+    /// out.
     pub fn judge(&mut self) -> Option<Quality> {
         let held_out = self.held_out();
         let (mut psnr_db, mut ssim) = (0.0, 0.0);
@@ -262,15 +262,15 @@ impl<'a> Trainer<'a> {
         (photos > 0).then_some(Quality { photos, psnr_db: psnr_db * share, ssim: ssim * share })
     }
 
-    /// Returns which photos of the dataset are held out.
+    /// Returns the indices of the held-out photos.
     pub fn held_out(&self) -> Vec<usize> {
         (0..self.dataset.photos.len()).filter(|&i| self.is_held_out(i)).collect()
     }
 
-    /// Renders what a photo of the dataset shows, exposed as fits it best.
+    /// Renders the view of a photo, with the best-fitting exposure.
     ///
     /// # Panics
-    /// If there is no such photo.
+    /// If the index is out of range.
     pub fn compare(&mut self, photo: usize) -> Comparison {
         let Photo { view, target, .. } = &self.dataset.photos[photo];
         let style = Style { degree: self.options.degree, ..self.style() };
@@ -303,7 +303,7 @@ impl<'a> Trainer<'a> {
         (0..self.dataset.photos.len()).filter(|&i| !self.is_held_out(i))
     }
 
-    /// Returns the next photo: each once in a random order, then all again.
+    /// Returns the next photo: each once in random order, then all again.
     fn draw(&mut self) -> usize {
         if self.queue.is_empty() {
             self.queue = self.trained().collect();
@@ -312,12 +312,12 @@ impl<'a> Trainer<'a> {
         self.queue.pop().expect("some photo is trained with")
     }
 
-    /// Returns the share of the steps that are done.
+    /// Returns the fraction of completed steps.
     fn progress(&self) -> f32 {
         self.step as f32 / self.options.steps.max(1) as f32
     }
 
-    /// Returns a factor that falls from 1 to `end`, evenly by its logarithm.
+    /// Returns a factor that falls exponentially from 1 to `end`.
     fn decay(&self, end: f32) -> f32 {
         end.powf(self.progress().min(1.0))
     }
@@ -338,13 +338,13 @@ impl<'a> Trainer<'a> {
         }
     }
 
-    /// Whether Gaussians still move house: not at first, when nothing is known, nor at the end, when
-    /// everything settles.
+    /// Returns whether Gaussians are relocated at this step: not at the start, before errors are known, nor at the end,
+    /// when the result settles.
     fn is_moving(&self) -> bool {
         (0.02..0.85).contains(&self.progress())
     }
 
-    /// Returns by how many to grow so that the budget is reached after [`GROWN`] of the steps.
+    /// Returns the number of Gaussians to add, so that the maximum is reached after [`GROWN`] of the steps.
     fn growth(&self) -> usize {
         let (count, budget) = (self.gaussians.len(), self.options.splats);
         let left = (GROWN - self.progress()) * self.options.steps as f32 / RELOCATE_EVERY as f32;
@@ -354,12 +354,12 @@ impl<'a> Trainer<'a> {
     }
 }
 
-/// Returns what of the Gaussians a device does not have as it is; see [`Trainer::stale`].
+/// Returns the difference between the device's Gaussians and the host's; see [`Trainer::stale`].
 fn changed(stale: Option<usize>, seen: &[u32]) -> Changed<'_> {
     stale.map_or(Changed::All, |columns| Changed::Rows { rows: seen, columns })
 }
 
-/// Adds the errors seen through some rows, which ascend, to theirs.
+/// Adds the errors of the visible rows, in ascending order, to the sums.
 fn note(errors: &mut [f32], seen: &[u32], gradients: &[RowGradient]) {
     errors.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, errors)| {
         let first = chunk * CHUNK;
@@ -370,14 +370,14 @@ fn note(errors: &mut [f32], seen: &[u32], gradients: &[RowGradient]) {
     });
 }
 
-/// Keeps the items, `width` numbers each, that `keep` says.
+/// Keeps the items (`width` values each) for which `keep` returns true.
 pub(crate) fn retain<T: Copy>(list: &mut Vec<T>, width: usize, keep: impl Fn(usize) -> bool) {
     let kept = list.chunks_exact(width).enumerate().filter(|(i, _)| keep(*i));
     *list = kept.flat_map(|(_, item)| item.iter().copied()).collect();
 }
 
 impl ExposureState {
-    /// One step of Adam, pulled to no change at all, without which all photos could grow brighter.
+    /// Runs one Adam step, pulled towards the identity; otherwise all photos could become brighter.
     fn apply(&mut self, by: &Exposure, rate: f32) {
         self.steps += 1;
         let (bias1, bias2) = (1.0 - 0.9f32.powi(self.steps), 1.0 - 0.999f32.powi(self.steps));
@@ -395,19 +395,19 @@ impl ExposureState {
     }
 }
 
-/// Step of the means at first. [extents of the capture]
+/// Initial learning rate of the means. [extents of the capture]
 const MEAN_RATE: f32 = 4e-4;
-/// Noise of the faint, in steps of the means (Kheradmand et al. 2024, their implementation).
+/// Noise on faint Gaussians, in learning rates of the means (Kheradmand et al. 2024, their implementation).
 const NOISE: f32 = 5e5;
 const RELOCATE_EVERY: u32 = 50;
-/// Share of the steps after which the budget is reached.
+/// Fraction of the steps after which the maximum number of Gaussians is reached.
 const GROWN: f32 = 0.5;
-/// At most this many times as many at once.
+/// Maximum factor of growth per relocation.
 const MAX_GROWTH: f32 = 1.5;
-/// Harmonics come degree by degree: the third after three fifths.
+/// Number of degrees per training: each degree is added after a fifth of the steps, the third after three fifths.
 const DEGREES_PER_TRAINING: f32 = 5.0;
 const EXPOSURE_RATE: f32 = 3e-3;
-/// How strongly exposures are held to no change.
+/// Strength of the exposures' pull towards the identity.
 const EXPOSURE_PULL: f32 = 0.02;
 
 #[cfg(test)]

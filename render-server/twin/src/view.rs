@@ -1,10 +1,10 @@
-//! The camera of one image, as the passes need it: a pinhole.
+//! Pinhole camera of one image, as the passes need it.
 
 use glam::{DMat3, Vec3};
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
 use vizflyt_splat::limits::JACOBIAN_MARGIN;
 
-/// A pinhole camera at a place. Units of length are the dataset's.
+/// Pinhole camera with a pose, in the dataset's unit of length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct View {
     /// Image width. [px]
@@ -17,11 +17,11 @@ pub struct View {
     pub center: [f32; 2],
     /// Rows of `cam_from_world`: right, down, forward. [world]
     pub rows: [Vec3; 3],
-    /// Where the camera is. [world]
+    /// Camera position. [world]
     pub position: Vec3,
-    /// What is closer is not seen.
+    /// Minimum depth: closer points are not rendered.
     pub near: f32,
-    /// Slopes between which the projection is linearised at the splat itself, x and y.
+    /// Range of slopes (x and y) within which the projection is linearised at the splat; outside, at the limit.
     pub slopes: [[f32; 2]; 2],
 }
 
@@ -31,7 +31,7 @@ impl View {
     /// # Panics
     /// If the intrinsics have a distortion: images are undistorted when they are read.
     pub fn new(k: &Intrinsics, world_from_cam: &Pose<World, Cam>, near: f32) -> Self {
-        assert_eq!(k.distortion, Distortion::None, "training knows pinholes alone");
+        assert_eq!(k.distortion, Distortion::None, "training supports only pinhole cameras");
         let rows = DMat3::from_quat(world_from_cam.rotation.normalize());
         let bounds = |center: f64, focal: f64, size: u32| {
             let (low, high) = (-center / focal, (f64::from(size) - center) / focal);
@@ -50,7 +50,7 @@ impl View {
         }
     }
 
-    /// Returns the pinhole.
+    /// Returns the intrinsics.
     pub fn intrinsics(&self) -> Intrinsics {
         Intrinsics {
             width_px: self.width as u32,
@@ -69,7 +69,7 @@ impl View {
         Vec3::new(self.rows[0].dot(d), self.rows[1].dot(d), self.rows[2].dot(d))
     }
 
-    /// Returns where a point is seen [px] and its z; `None` unless it is ahead.
+    /// Returns a point's pixel and its z; `None` if it is not in front of the camera.
     pub fn project(&self, p_world: Vec3) -> Option<([f32; 2], f32)> {
         let p = self.in_cam(p_world);
         (p.z > self.near).then(|| {
@@ -93,7 +93,7 @@ mod tests {
     use glam::{DQuat, DVec3};
 
     #[test]
-    fn unproject_then_project_is_the_same_pixel() {
+    fn project_inverts_unproject() {
         let k = Intrinsics::from_horizontal_fov(320, 240, 1.3);
         let pose = Pose::new(
             DVec3::new(1.0, 2.0, -0.5),
@@ -101,7 +101,7 @@ mod tests {
         );
         let view = View::new(&k, &pose, 0.05);
         let p = view.unproject([17.5, 201.0], 3.25);
-        // The contract's own projection says the same.
+        // The protocol's own projection gives the same pixel.
         let pixel = k.project(pose.inverse().transform_point(p.as_dvec3())).unwrap();
         assert!((pixel - glam::DVec2::new(17.5, 201.0)).length() < 1e-3);
         let ([x, y], z) = view.project(p).unwrap();

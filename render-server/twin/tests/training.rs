@@ -1,5 +1,5 @@
-//! Folders to datasets, and datasets to twins: a room of a few splats, photographed, written as COLMAP and
-//! nerfstudio do, read, and trained.
+//! Reads folders as datasets, and trains twins: photos of a small synthetic wall, written in the formats of COLMAP and
+//! nerfstudio.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -18,13 +18,13 @@ fn intrinsics() -> Intrinsics {
     Intrinsics::from_horizontal_fov(48, 36, 1.2)
 }
 
-/// Along a line, looking at a wall 3 units ahead.
+/// Returns poses along a line, looking at a wall 3 units ahead.
 fn pose(i: usize) -> Pose<World, Cam> {
     let x = 0.3 * (i as f64 - 2.5);
     Pose::new(DVec3::new(x, 0.1 * (i % 2) as f64, 0.0), DQuat::from_rotation_y(-0.1 * x))
 }
 
-/// A wall of coloured discs.
+/// Returns a wall of coloured discs.
 fn wall() -> Splats {
     let mut random = Random::new(2);
     let mut splats = Splats::default();
@@ -133,7 +133,7 @@ fn train(dataset: &Dataset) -> (f64, Splats) {
 }
 
 #[test]
-fn a_wall_is_rebuilt_from_either_kind_of_folder() {
+fn rebuilds_a_wall_from_both_dataset_formats() {
     for write in [colmap as fn(&Path), nerfstudio] {
         let folder = tempfile::tempdir().unwrap();
         write(folder.path());
@@ -142,7 +142,7 @@ fn a_wall_is_rebuilt_from_either_kind_of_folder() {
         let before = Trainer::new(&dataset, options()).judge().unwrap().psnr_db;
         let (after, splats) = train(&dataset);
         assert!(after > before + 0.5 && after > 22.0, "{before:.1} dB, then {after:.1}");
-        // Where it is, not only how it looks.
+        // Check the depth, not only the appearance.
         let image =
             render_reference(&splats, &[], &Camera::new(intrinsics(), pose(3), 0.05)).unwrap();
         let mut errors: Vec<f32> =
@@ -153,7 +153,7 @@ fn a_wall_is_rebuilt_from_either_kind_of_folder() {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_twin_on_any_number_of_threads() {
+fn same_seed_gives_the_same_twin_for_any_number_of_threads() {
     let folder = tempfile::tempdir().unwrap();
     colmap(folder.path());
     let dataset = Dataset::read(folder.path(), None).unwrap();
@@ -162,10 +162,11 @@ fn the_same_seed_gives_the_same_twin_on_any_number_of_threads() {
         pool.install(|| train(&dataset))
     };
     let one = on(1);
-    assert!(one == on(4), "four threads train another twin");
+    assert!(one == on(4), "four threads train a different twin");
 }
 
-/// Trains; loses the device after so many steps. Returns the loss of each step, and PSNR of held-out photos.
+/// Trains, and loses the device after a number of steps. Returns the loss of each step, and the PSNR of held-out
+/// photos.
 fn train_on(dataset: &Dataset, passes: Passes, lost_after: u32) -> (Vec<f64>, f64) {
     let mut trainer = Trainer::with(dataset, options(), passes);
     let mut losses = Vec::new();
@@ -179,7 +180,7 @@ fn train_on(dataset: &Dataset, passes: Passes, lost_after: u32) -> (Vec<f64>, f6
 }
 
 #[test]
-fn a_graphics_card_trains_as_the_processor_does() {
+fn graphics_card_trains_like_the_processor() {
     let Some(adapter) = Adapter::all().into_iter().next() else {
         println!("skipped: no graphics adapter; install mesa-vulkan-drivers and libvulkan1");
         return;
@@ -191,8 +192,8 @@ fn a_graphics_card_trains_as_the_processor_does() {
     let (expected, expected_db) = train_on(&dataset, Passes::cpu(), u32::MAX);
     let first = train_on(&dataset, passes(), u32::MAX);
     let lost = train_on(&dataset, passes(), 70);
-    assert!(first.0[..70] == lost.0[..70], "the same device trains another twin");
-    // Rounding grows with the steps; where training goes it does not.
+    assert!(first.0[..70] == lost.0[..70], "the same device trains a different twin");
+    // Rounding differences grow with the steps, but the course of the training stays the same.
     for (what, (losses, db)) in [("gpu", first), ("gpu, lost after 70 steps", lost)] {
         println!("{what}: {db:.2} dB for {expected_db:.2}");
         assert!((db - expected_db).abs() < 0.5, "{what}: {db} dB for {expected_db}");
@@ -204,13 +205,13 @@ fn a_graphics_card_trains_as_the_processor_does() {
 }
 
 #[test]
-fn a_training_that_was_interrupted_ends_as_one_that_was_not() {
+fn resumed_training_equals_an_uninterrupted_one() {
     let folder = tempfile::tempdir().unwrap();
     colmap(folder.path());
     let dataset = Dataset::read(folder.path(), None).unwrap();
     let whole = train(&dataset);
     let mut trainer = Trainer::new(&dataset, options());
-    // In the middle of the photos, of a move, and before either; each time by way of bytes.
+    // Stop in the middle of a pass over the photos, at a relocation, and around it; each time through bytes.
     for stop in [7, 50, 51, 99, 150] {
         while trainer.steps() < stop {
             trainer.step();
@@ -233,7 +234,7 @@ fn a_training_that_was_interrupted_ends_as_one_that_was_not() {
 }
 
 #[test]
-fn photos_become_smaller_and_poses_stay() {
+fn reduces_photos_and_keeps_poses() {
     let folder = tempfile::tempdir().unwrap();
     colmap(folder.path());
     let whole = Dataset::read(folder.path(), None).unwrap();
@@ -247,7 +248,7 @@ fn photos_become_smaller_and_poses_stay() {
 }
 
 #[test]
-fn photos_that_are_not_there_are_left_out_and_named() {
+fn omits_and_names_missing_photos() {
     let folder = tempfile::tempdir().unwrap();
     colmap(folder.path());
     let remove = |i: usize| {
@@ -262,7 +263,7 @@ fn photos_that_are_not_there_are_left_out_and_named() {
 }
 
 #[test]
-fn a_damaged_folder_is_refused_in_words() {
+fn error_names_the_fault_of_a_damaged_folder() {
     let folder = tempfile::tempdir().unwrap();
     let refused = |says: &str| {
         let error = Dataset::read(folder.path(), None).unwrap_err().to_string();

@@ -1,5 +1,4 @@
-//! Models that real structure from motion made of rendered walks, and what the verdict makes of them: see
-//! `tests/captures/README.md`.
+//! Verdicts about models that real structure from motion made of rendered walks; see `tests/captures/README.md`.
 
 use std::path::PathBuf;
 
@@ -78,7 +77,7 @@ fn is_refused(verdict: &Verdict, check: Check) -> bool {
 }
 
 #[test]
-fn a_proper_walk_comes_out_metric_and_may_be_flown() {
+fn correct_walk_is_metric_and_accepted() {
     let Recorded { walk, capture, adjusted, verdict } = recorded("proper");
     assert!(verdict.is_fit_to_fly(), "{verdict:#?}");
     let truth = |name: &str| {
@@ -94,13 +93,14 @@ fn a_proper_walk_comes_out_metric_and_may_be_flown() {
     let to = points::fit(&pairs, 1e3).unwrap().world_from_scene;
     let (scale, tilt) = (to.scale - 1.0, (to.rotation * DVec3::Z).angle_between(DVec3::Z));
     let (by_scale, by_tilt) = (adjusted.scale_sigma.unwrap(), adjusted.tilt_sigma_rad.unwrap());
-    // The bounds hold. Of the whole capture scale is off by 0.14 %, of its few points by twice that.
+    // The bounds hold. The scale of the complete capture is off by 0.14 %, that of its few recorded points by twice
+    // that.
     assert!(scale.abs() < 4e-3 && scale.abs() < 3.0 * by_scale, "{scale} {by_scale}");
     assert!(tilt.to_degrees() < 0.2 && tilt < 3.0 * by_tilt, "{tilt} {by_tilt}");
 }
 
 #[test]
-fn a_model_that_is_metres_wrong_with_all_images_placed_is_refused() {
+fn rejects_a_model_with_metre_errors_although_all_images_are_placed() {
     let Recorded { walk, capture, verdict, .. } = recorded("deceived");
     assert_eq!(capture.images.len(), walk.given.len());
     assert!(is_refused(&verdict, Check::Continuity), "{verdict:#?}");
@@ -108,7 +108,7 @@ fn a_model_that_is_metres_wrong_with_all_images_placed_is_refused() {
 }
 
 #[test]
-fn a_symmetric_hall_that_was_folded_is_refused_for_its_leaps() {
+fn rejects_a_folded_symmetric_hall_by_its_leaps() {
     let Recorded { walk, capture, verdict, .. } = recorded("folded");
     assert_eq!(capture.images.len(), walk.given.len());
     assert!(is_refused(&verdict, Check::Continuity), "{verdict:#?}");

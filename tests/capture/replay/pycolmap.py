@@ -1,7 +1,7 @@
-"""Stands in for pycolmap: returns the poses in `tests/capture/recorded` in place of new ones, which vary with each run.
-Has what `vizflyt scene capture` calls, and nothing else.
+"""Replaces pycolmap: returns the poses in `tests/capture/recorded` instead of new ones, which vary from run to run. Has
+only the functions that `vizflyt scene capture` calls.
 
-FILM_RATE_HZ in the environment is the rate of the film that the video was made of.
+FILM_RATE_HZ in the environment is the rate of the film behind the video.
 """
 
 import json
@@ -30,7 +30,7 @@ def extract_features(database, images, camera_mode, reader_options, extraction_o
     lens = (RECORDED / "cameras.txt").read_text().split()
     asked = [float(value) for value in reader_options.camera_params.split(",")]
     assert reader_options.camera_model == lens[1], reader_options.camera_model
-    # A lens that is given is kept.
+    # A given lens stays unchanged.
     assert all(abs(a - float(b)) < 1e-9 for a, b in zip(asked, lens[4:], strict=True)), (asked, lens)
     Path(database).touch()
 
@@ -42,7 +42,7 @@ def match_image_pairs(database, pairing_options):
 
 
 def incremental_mapping(database, images, models, options):
-    """Writes the recorded model of the pictures in the folder `images`, under their own names."""
+    """Writes the recorded model of the pictures in the folder `images`, with their names."""
     rate_hz = float(os.environ["FILM_RATE_HZ"])
     pictures = json.loads(Path(images).with_suffix(".json").read_text())["result"]["pictures"]
     name_of = {f"{round(picture['at_s'] * rate_hz):05d}.jpg": picture["name"] for picture in pictures}

@@ -1,6 +1,7 @@
-//! How well and how fast the vehicle is located: the tables of docs/BENCHMARKS.md.
+//! Accuracy and speed of the localization by tags: the tables of docs/BENCHMARKS.md.
 //!
-//! `cargo bench -p vizflyt-e2e --bench locate`; a number after `--` is the seconds of each flight, 0 leaves them out.
+//! `cargo bench -p vizflyt-e2e --bench locate`; a number after `--` is the duration of each flight in seconds, 0 omits
+//! flights.
 
 #[path = "../tests/accuracy/flights.rs"]
 mod flights;
@@ -16,7 +17,7 @@ use vizflyt_tags::locate::{LocateSettings, Locator, StampedImage};
 use vizflyt_tags::simulated::{Sensor, SimulatedCamera, Truth, cube, over_mat, webcams};
 
 fn main() {
-    // cargo passes `--bench` on.
+    // cargo passes `--bench` to the program.
     let seconds = std::env::args().skip(1).find_map(|word| word.parse::<f64>().ok()).unwrap_or(4.0);
     if seconds > 0.0 {
         accuracy(seconds);
@@ -121,7 +122,7 @@ fn speed() {
             LocateSettings::default(),
         )
         .expect("the lab is sound");
-        // It is found first.
+        // The first images are for detection.
         for (stamp, image) in &images[..4] {
             locator.handle_images(&[StampedImage { camera: 0, stamp: *stamp, image }]);
         }
@@ -169,7 +170,7 @@ fn speed() {
     }
 }
 
-/// Returns the processor time that this thread has used: other programs take none of it. [ms]
+/// Returns the processor time of this thread, which does not include other programs. [ms]
 fn thread_ms() -> f64 {
     let time = clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).expect("the clock exists");
     time.tv_sec() as f64 * 1e3 + time.tv_nsec() as f64 * 1e-6

@@ -1,4 +1,4 @@
-//! Black-box tests of the real binaries; what they share.
+//! Black-box tests of the real binaries: common helpers.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -6,10 +6,10 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc::{self, Receiver};
 use std::time::{Duration, Instant};
 
-/// Returns the `vizflyt` program built beside this test.
+/// Returns the path of the `vizflyt` program built next to this test.
 ///
 /// # Panics
-/// If it is not built; the message has the command.
+/// If it is not built; the message names the command.
 pub fn vizflyt() -> PathBuf {
     // target/PROFILE/deps/this-test
     let test = std::env::current_exe().expect("a test knows its own path");
@@ -22,7 +22,7 @@ pub fn vizflyt() -> PathBuf {
     program
 }
 
-/// Runs `vizflyt ARGS` to its end.
+/// Runs `vizflyt ARGS` and waits for its end.
 ///
 /// # Panics
 /// If the program cannot be started.
@@ -30,10 +30,10 @@ pub fn run(args: &[&str]) -> Output {
     Command::new(vizflyt()).args(args).output().expect("vizflyt starts")
 }
 
-/// Runs `vizflyt ARGS` in a folder; returns whether it succeeded, and all that it printed.
+/// Runs `vizflyt ARGS` in a folder; returns whether it succeeded, and all of its output.
 ///
 /// # Panics
-/// If it cannot be started.
+/// If the program cannot be started.
 pub fn run_in(folder: &Path, args: &[&str]) -> (bool, String) {
     let output =
         Command::new(vizflyt()).current_dir(folder).args(args).output().expect("vizflyt starts");
@@ -41,7 +41,7 @@ pub fn run_in(folder: &Path, args: &[&str]) -> (bool, String) {
     (output.status.success(), String::from_utf8_lossy(&text).into_owned())
 }
 
-/// Runs `vizflyt ARGS`, and returns standard output.
+/// Runs `vizflyt ARGS`, and returns its standard output.
 ///
 /// # Panics
 /// If it fails; the message is its standard error.
@@ -55,7 +55,7 @@ pub fn good(args: &[&str]) -> String {
 /// Runs `vizflyt ARGS`, which must fail with a message that contains every given text.
 ///
 /// # Panics
-/// If it does otherwise.
+/// If it succeeds, panics, or prints another message.
 pub fn check_refused(args: &[&str], texts: &[&str]) {
     let output = run(args);
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -71,8 +71,8 @@ pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).expect("tests/e2e").to_owned()
 }
 
-/// The parameters of `hardware/airframe` that say what the autopilot does by itself when something is lost, and how fast
-/// it flies: the runtime cannot act for an autopilot that does not receive it.
+/// Parameters of `hardware/airframe` for the autopilot's own failsafes and speeds. The runtime cannot act for an
+/// autopilot that it does not reach.
 const FAILSAFE_PARAMETERS: [&str; 26] = [
     "FS_GCS_ENABLE",
     "FS_GCS_TIMEOUT",
@@ -102,10 +102,10 @@ const FAILSAFE_PARAMETERS: [&str; 26] = [
     "LAND_ALT_LOW_M",
 ];
 
-/// Returns the names and values of [`FAILSAFE_PARAMETERS`], as the files in `hardware/airframe` have them.
+/// Returns the names and values of [`FAILSAFE_PARAMETERS`] from the file in `hardware/airframe`.
 ///
 /// # Panics
-/// If a file lacks one of them.
+/// If a parameter is missing.
 pub fn airframe_parameters() -> Vec<(String, f32)> {
     let path = root().join("hardware/airframe/whippet-copter-4.8.param");
     let text = std::fs::read_to_string(path).expect("the vehicle's parameters are there");
@@ -119,25 +119,25 @@ pub fn airframe_parameters() -> Vec<(String, f32)> {
     values
 }
 
-/// How often a flight's images are drawn, unless a test is about rates: what runs aside gets its time. [Hz]
+/// Maximum image rate of a flight, unless a test is about rates: leaves processor time for other tests. [Hz]
 const MAX_RATE_HZ: f64 = 40.0;
 
-/// A running `vizflyt` whose output can be waited for. Killed when dropped.
+/// A running `vizflyt` with captured output. Killed when dropped.
 pub struct Demo {
     child: Child,
     lines: Receiver<String>,
-    /// What it has printed so far, for failure messages.
+    /// Lines printed so far, for failure messages.
     pub seen: Vec<String>,
     started: Instant,
-    /// [`cpu_waits_s`] at its start.
+    /// [`cpu_waits_s`] at the start.
     cpu_waited_s: f64,
 }
 
-/// Share of the time in which tasks wait for a processor, from which on the machine is too busy to promise a live flight.
+/// Fraction of time in which tasks wait for a processor, above which a machine is too busy for a live flight.
 const BUSY: f64 = 0.3;
 
-/// Returns for how long some task of this machine has waited for a processor, since it started (Linux's pressure stall
-/// information); 0 where the kernel does not count it. [s]
+/// Returns the total time in which some task has waited for a processor (Linux's pressure stall information); 0 if the
+/// kernel does not measure it. [s]
 fn cpu_waits_s() -> f64 {
     let text = std::fs::read_to_string("/proc/pressure/cpu").unwrap_or_default();
     let total_us = text.split("total=").nth(1).and_then(|rest| rest.split_whitespace().next());
@@ -145,18 +145,18 @@ fn cpu_waits_s() -> f64 {
 }
 
 impl Demo {
-    /// Whether the flight of `report` has finished. If not, the machine has stood still until a safety rule landed the
-    /// vehicle in order, and there is nothing else to check.
+    /// Returns whether the flight of `report` has finished. If not, the machine was too busy and a safety rule landed
+    /// the vehicle; then there is nothing else to check.
     ///
     /// # Panics
-    /// If it ended in another way.
+    /// If the flight ended in another way.
     pub fn has_finished(&self, report: &serde_json::Value, code: Option<i32>) -> bool {
         let explained = format!("{report:#} {:#?}", self.seen);
         if report["outcome"] == "finished" {
             assert_eq!(code, Some(0), "{explained}");
             return true;
         }
-        // What the simulator does not give up it catches up with; other processes may have stood still instead.
+        // The simulator catches up if it falls behind only a little; other processes may have been delayed instead.
         let stood_still = report["seconds_given_up"].as_f64() > Some(0.1);
         let waited = (cpu_waits_s() - self.cpu_waited_s) / self.started.elapsed().as_secs_f64();
         assert!(
@@ -171,7 +171,7 @@ impl Demo {
         false
     }
 
-    /// Starts `vizflyt demo --headless ARGS`, which draws [`MAX_RATE_HZ`] at most unless they say otherwise.
+    /// Starts `vizflyt demo --headless ARGS`, at [`MAX_RATE_HZ`] unless `ARGS` contain a rate.
     ///
     /// # Panics
     /// If the program cannot be started.
@@ -215,7 +215,7 @@ impl Demo {
     /// Waits until a line contains `text` and returns it.
     ///
     /// # Panics
-    /// If none does within `limit`, or the demo ends first.
+    /// If no line does within `limit`, or the program ends first.
     pub fn wait_for(&mut self, text: &str, limit: Duration) -> String {
         let deadline = Instant::now() + limit;
         loop {
@@ -235,7 +235,7 @@ impl Demo {
     /// Waits for the end; returns the exit code, or `None` after a signal.
     ///
     /// # Panics
-    /// If it has not ended within `limit`.
+    /// If the program has not ended within `limit`.
     pub fn wait(&mut self, limit: Duration) -> Option<i32> {
         let deadline = Instant::now() + limit;
         loop {
@@ -295,7 +295,7 @@ pub fn descendants(root: u32) -> Vec<u32> {
     family.split_off(1)
 }
 
-/// Whether a process with this id runs (a zombie does not).
+/// Returns whether a process runs (not for a zombie).
 pub fn alive(pid: u32) -> bool {
     std::fs::read_to_string(format!("/proc/{pid}/stat"))
         .is_ok_and(|stat| !stat.rsplit(')').next().unwrap_or("").trim_start().starts_with('Z'))

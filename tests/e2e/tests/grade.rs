@@ -1,5 +1,4 @@
-//! `vizflyt grade` as an instructor uses it: the same hash on every run, signatures, parts, reports, and
-//! what becomes of plugins that fail.
+//! `vizflyt grade` as an instructor uses it: reproducible hashes, signatures, shards, reports, and failing plugins.
 
 use std::fs;
 use std::io::Read;
@@ -14,7 +13,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 use vizflyt_e2e::{root, vizflyt};
 
-/// An instructor with a folder of keys, and a place for files.
+/// An instructor's temporary folder with keys and files.
 struct Rig {
     folder: TempDir,
 }
@@ -60,9 +59,9 @@ impl Rig {
 
 const FOREST: [&str; 5] = ["avoid", "--project=forest", "--seeds=2", "--image-rate=15", "--json"];
 
-/// A starved server, on the virtual clock: ten images a second, each 200 ms old on arrival, and 50 ms for the answer.
+/// A slow server on the virtual clock: ten images per second, each 200 ms old at arrival, and 50 ms for the reply.
 #[test]
-fn late_and_rare_images_make_the_example_touch_nothing() {
+fn example_avoids_all_obstacles_with_late_and_rare_images() {
     let rig = Rig::new();
     let starved = ["--image-rate=10", "--image-delay=200", "--answer-delay=50", "--seeds=4"];
     let args = [&["avoid", "--project=forest", "--json"], &starved[..]].concat();
@@ -78,7 +77,7 @@ fn with<'a>(more: &[&'a str]) -> Vec<&'a str> {
 }
 
 #[test]
-fn two_runs_give_the_same_grade_under_load_and_parts_make_the_whole() {
+fn merged_shards_equal_the_complete_grade() {
     let rig = Rig::new();
     let one = rig.grade(&with(&["--jobs=2"]));
     assert_eq!(one["hash"].as_str().unwrap().len(), 64);
@@ -93,7 +92,7 @@ fn two_runs_give_the_same_grade_under_load_and_parts_make_the_whole() {
     }
     assert_ne!(runs[0]["hash"], runs[1]["hash"]);
 
-    // Again in two parts, one flight at a time: figures, hashes and signature are the same.
+    // Again in two shards, one flight at a time: figures, hashes and signature are the same.
     let parts = ["1/2", "2/2"].map(|shard| {
         let file = rig.at(&format!("part-{}.json", &shard[..1]));
         let part = rig.grade(&with(&[&format!("--shard={shard}"), "--jobs=1", "-o", &file]));
@@ -112,11 +111,11 @@ fn two_runs_give_the_same_grade_under_load_and_parts_make_the_whole() {
     for field in ["hash", "subject", "summary", "runs"] {
         assert_eq!(merged[field], one[field]);
     }
-    // But for the report's files.
+    // Equal except for the report's files.
     assert!(merged.as_object_mut().unwrap().remove("files").is_some());
     assert_eq!(merged.as_object().unwrap().len(), one.as_object().unwrap().len());
 
-    // As signed; not after a change, and not with another's key.
+    // The signature is valid, but not after a change, and not for another key.
     rig.good(&["verify", &whole]);
     let public = rig.good(&["key"]);
     rig.good(&["verify", &whole, "--key", public.trim()]);
@@ -135,7 +134,7 @@ fn two_runs_give_the_same_grade_under_load_and_parts_make_the_whole() {
 }
 
 #[test]
-fn another_inertial_sensor_is_another_flight_and_is_named() {
+fn grade_names_the_inertial_sensor_and_depends_on_it() {
     let rig = Rig::new();
     let flown = |more: &[&str]| {
         let one = ["avoid", "--project=forest", "--seeds=1", "--image-rate=15", "--json"];
@@ -149,10 +148,10 @@ fn another_inertial_sensor_is_another_flight_and_is_named() {
     assert_ne!(chip["runs"][0]["hash"], usual["runs"][0]["hash"]);
 }
 
-/// A machine that is suspended, swapped out or starved must not cost points: in lock-step a plugin knows its runtime by
-/// its socket, not by a clock.
+/// A machine that is suspended, swapping or overloaded must not cost points: in lock-step, a plugin detects the end of
+/// its runtime by the socket, not by a clock.
 #[test]
-fn a_grader_that_is_stopped_for_seconds_gives_the_same_grade() {
+fn grader_stopped_for_seconds_gives_the_same_grade() {
     let rig = Rig::new();
     let args = ["avoid", "--project=forest", "--seeds=1", "--image-rate=15", "--json"];
     let hash = rig.grade(&args)["hash"].clone();
@@ -176,7 +175,7 @@ fn a_grader_that_is_stopped_for_seconds_gives_the_same_grade() {
             }
             stops
         });
-        // Not waited for yet: until then nobody else gets its number.
+        // The process has not been waited for yet, so its pid is not reused.
         grader.stdout.take().unwrap().read_to_string(&mut output).unwrap();
         done.store(true, Ordering::Relaxed);
         stopper.join().unwrap()
@@ -194,8 +193,8 @@ fn start(rig: &Rig, args: &[&str]) -> Child {
     command.spawn().unwrap()
 }
 
-/// Waits for a built-in plugin of the grader's: another process in whose command line `plugin` comes first, and which
-/// the grader, or who keeps the plugin's cell, has started.
+/// Waits for the grader's built-in plugin: a process whose first argument is `plugin`, started by the grader or by the
+/// process of the plugin's cell.
 fn plugin_of(grader: &Child) -> Pid {
     let (grader, is_plugin) = (grader.id(), |id: u32| {
         let line = fs::read(format!("/proc/{id}/cmdline")).unwrap_or_default();
@@ -217,17 +216,17 @@ fn plugin_of(grader: &Child) -> Pid {
     }
 }
 
-/// A plugin's limit is counted in its own time, not by the clock on the wall: one that somebody else stops for longer
-/// than an answer may take has the same grade.
+/// A plugin's time limit counts its own processor time, not wall-clock time: a plugin stopped by another process for
+/// longer than the limit has the same grade.
 #[test]
-fn a_plugin_that_is_stopped_for_seconds_gives_the_same_grade() {
+fn plugin_stopped_for_seconds_gives_the_same_grade() {
     let rig = Rig::new();
     let args = ["avoid", "--project=forest", "--seeds=1", "--image-rate=15", "--json"];
     let hash = rig.grade(&args)["hash"].clone();
     let within = [&args[..], &["--answer-within=1"]].concat();
     let grader = start(&rig, &within);
     let plugin = plugin_of(&grader);
-    // As it starts, and at any moment after; once together with the grader, which goes on first.
+    // At the start, and at any later time; once together with the grader, which continues first.
     let id = Pid::from_raw(grader.id().cast_signed());
     for (after_ms, also) in [(30, None), (700, None), (900, Some(id))] {
         std::thread::sleep(Duration::from_millis(after_ms));
@@ -246,9 +245,9 @@ fn a_plugin_that_is_stopped_for_seconds_gives_the_same_grade() {
     assert_eq!(graded["hash"], hash, "{graded:#}");
 }
 
-/// What somebody else did to a plugin is no grade: the flight is flown again, and in the end nothing is graded.
+/// A plugin killed by another process is not graded: the flight is repeated, and without success nothing is graded.
 #[test]
-fn a_flight_that_is_lost_is_flown_again_and_never_graded() {
+fn lost_flights_are_repeated_and_never_graded() {
     let rig = Rig::new();
     let args = ["avoid", "--project=forest", "--seeds=1", "--image-rate=15", "--json"];
     let hash = rig.grade(&args)["hash"].clone();
@@ -265,9 +264,9 @@ fn a_flight_that_is_lost_is_flown_again_and_never_graded() {
     rig.refused(&[&always, "--project=forest", "--seeds=1"], "not flown to its end in 3 attempts");
 }
 
-/// Who draws lots, and ends itself where the lot is a bad one, is found out by the way that it flew.
+/// A plugin that behaves randomly and kills itself after a bad start is detected by the difference of its flights.
 #[test]
-fn who_draws_lots_and_kills_itself_gets_no_second_lot() {
+fn plugin_that_kills_itself_to_retry_is_rejected() {
     let rig = Rig::new();
     let program = vizflyt().with_file_name("examples/misbehave");
     fs::copy(&program, rig.at("misbehave")).unwrap();
@@ -276,11 +275,11 @@ fn who_draws_lots_and_kills_itself_gets_no_second_lot() {
     rig.refused(&args, "differs before the point where the first one was lost");
 }
 
-/// Where a plugin gets no cell, its grade is worth no signature.
+/// Without sandbox cells, a grade is not signed.
 #[test]
-fn without_namespaces_nothing_is_signed() {
+fn does_not_sign_without_namespaces() {
     let rig = Rig::new();
-    // Root without the right to make them. Whoever is not root is kept from them otherwise.
+    // Root without the capability to create namespaces; other users have other restrictions.
     let is_root = nix::unistd::geteuid().is_root();
     let drop = ["--bounding-set=-sys_admin", "--inh-caps=-sys_admin"];
     let can_drop = is_root
@@ -303,7 +302,7 @@ fn without_namespaces_nothing_is_signed() {
 }
 
 #[test]
-fn a_seed_is_read_from_a_file_and_stands_on_no_command_line() {
+fn reads_the_seed_from_a_file() {
     let rig = Rig::new();
     let file = rig.at("seed");
     fs::write(&file, "4\n").unwrap();
@@ -317,7 +316,7 @@ fn a_seed_is_read_from_a_file_and_stands_on_no_command_line() {
     assert!(errors.contains("holds no seed") && !errors.contains("a secret"), "{errors}");
 }
 
-/// Keeps two processors busy until it is dropped.
+/// Keeps the processors busy until it is dropped.
 struct Load(Vec<Child>);
 
 impl Load {
@@ -337,7 +336,7 @@ impl Drop for Load {
 }
 
 #[test]
-fn eight_at_a_time_beside_a_full_load_and_killed_and_resumed_give_one_hash() {
+fn hash_does_not_depend_on_jobs_load_or_resuming() {
     let rig = Rig::new();
     let args = ["avoid", "--project=forest", "--seeds=3", "--image-rate=10", "--json"];
     let loaded = {
@@ -347,7 +346,7 @@ fn eight_at_a_time_beside_a_full_load_and_killed_and_resumed_give_one_hash() {
     let report = rig.at("report");
     let one = [&args[..], &["--jobs=1", "--report", &report]].concat();
     let mut grader = start(&rig, &one);
-    // Which is first is not told.
+    // The order of the flights is not defined.
     let record = |seed: u32| Path::new(&report).join(format!("flights/day-{seed}.json"));
     let seed = loop {
         match (1..=3).find(|&seed| record(seed).exists()) {
@@ -361,7 +360,7 @@ fn eight_at_a_time_beside_a_full_load_and_killed_and_resumed_give_one_hash() {
     grader.wait().unwrap();
     let kept = fs::read_to_string(&record).unwrap();
 
-    // Nothing is lost by accident, and nothing else is taken for it.
+    // Existing results are not overwritten, and only the same grade can be resumed.
     rig.refused(&one, "keep them with --resume");
     let resumed = [&one[..], &["--resume"]].concat();
     let other = |args: &[&str], word: &str| {
@@ -393,13 +392,13 @@ fn eight_at_a_time_beside_a_full_load_and_killed_and_resumed_give_one_hash() {
     assert_eq!((&grade["hash"], &grade["runs"]), (&loaded["hash"], &loaded["runs"]));
     assert_eq!(fs::read_to_string(&record).unwrap(), kept, "it was not flown again");
     rig.good(&["verify", &report]);
-    // Once more: all are there.
+    // Resume again: all flights are finished.
     assert_eq!(rig.grade(&resumed)["hash"], loaded["hash"]);
     rig.good(&["verify", &report]);
 }
 
 #[test]
-fn a_report_is_signed_to_its_last_file_and_its_logs_are_replayed() {
+fn all_files_of_a_report_are_signed_and_its_logs_can_be_replayed() {
     let rig = Rig::new();
     let (report, junit) = (rig.at("report"), rig.at("grade.xml"));
     let args = ["avoid", "--project=forest", "--seeds=1", "--image-rate=10", "--log=full"];
@@ -409,7 +408,7 @@ fn a_report_is_signed_to_its_last_file_and_its_logs_are_replayed() {
     let printed = rig.good(&["verify", &report, "--junit", &junit]);
     assert!(printed.contains("files are as signed"), "{printed}");
 
-    // A finished flight shows how it was won.
+    // The page shows the images of a finished flight.
     let page = fs::read_to_string(at("index.html")).unwrap();
     for part in ["Flights that finished", "images/day-1-00.jpg", "logs/day-1.mcap", "<svg"] {
         assert!(page.contains(part), "no {part}: {page}");
@@ -417,7 +416,7 @@ fn a_report_is_signed_to_its_last_file_and_its_logs_are_replayed() {
     let images = fs::read_dir(at("images")).unwrap().count();
     assert!((9..=17).contains(&images), "{images}");
 
-    // Whatever is changed, missing or added is named.
+    // Each changed, missing or added file is named.
     for path in
         ["index.html", "junit.xml", "images/day-1-03.jpg", "logs/day-1.mcap", "flights/day-1.json"]
     {
@@ -438,11 +437,11 @@ fn a_report_is_signed_to_its_last_file_and_its_logs_are_replayed() {
     fs::write(&junit, fs::read_to_string(&junit).unwrap().replace("errors=\"0\"", "errors=\"1\""))
         .unwrap();
     rig.refused(&["verify", &report, "--junit", &junit], "is not the JUnit XML of this grade");
-    // The document alone still counts, wherever it is.
+    // The document itself remains valid, at any path.
     let printed = rig.good(&["verify", at("grade.json").to_str().unwrap()]);
     assert!(printed.contains("were not checked"), "{printed}");
 
-    // The log is the flight: another plugin's process answers the same.
+    // In a replay of the log, a new process of the plugin gives the same replies.
     let log = at("logs/day-1.mcap");
     let answers = rig.at("answers.jsonl");
     let output = Command::new(vizflyt())
@@ -456,7 +455,7 @@ fn a_report_is_signed_to_its_last_file_and_its_logs_are_replayed() {
         String::from_utf8_lossy(&output.stderr)
     );
 
-    // Again, without logs: the same flight, and the earlier report is gone.
+    // Again, without logs: the same flight, and the earlier report is replaced.
     let hash = |report: &str| {
         let text = fs::read_to_string(Path::new(report).join("grade.json")).unwrap();
         serde_json::from_str::<Value>(&text).unwrap()["hash"].clone()
@@ -465,7 +464,7 @@ fn a_report_is_signed_to_its_last_file_and_its_logs_are_replayed() {
     rig.good(&[&args[..4], &["--log=none", "--report", &report]].concat());
     rig.good(&["verify", &report]);
     assert!(hash(&report) == first && !at("logs/day-1.mcap").exists());
-    // What lies in a report is signed, so nothing else may.
+    // All files of a report are signed, so other files are rejected.
     fs::write(at("notes.txt"), "").unwrap();
     rig.refused(&[&args[..4], &["--report", &report]].concat(), "notes.txt");
     fs::remove_file(at("notes.txt")).unwrap();
@@ -478,7 +477,7 @@ fn keys_of(rig: &Rig) -> String {
     format!("--keys={}", rig.at("keys"))
 }
 
-/// Runs `vizflyt leaderboard` on a database of the rig's; returns its output, or its refusal.
+/// Runs `vizflyt leaderboard` on the rig's database; returns its output, or its error.
 fn leaderboard(rig: &Rig, args: &[&str]) -> Result<String, String> {
     let database = format!("--database={}", rig.at("board.sqlite"));
     let output = Command::new(vizflyt()).args(["leaderboard", &database]).args(args).output();
@@ -487,7 +486,7 @@ fn leaderboard(rig: &Rig, args: &[&str]) -> Result<String, String> {
     if output.status.success() { Ok(text(output.stdout)) } else { Err(text(output.stderr)) }
 }
 
-/// A whole grade is added once, by whom the instructor names, and stands.
+/// A complete grade is added once, for the team that the instructor names.
 fn on_the_leaderboard(rig: &Rig, whole: &str, part: &str) {
     let keys = keys_of(rig);
     let add = |file: &str, team: &str| leaderboard(rig, &["add", file, team, &keys]);
@@ -521,7 +520,7 @@ fn on_the_leaderboard(rig: &Rig, whole: &str, part: &str) {
         (&1.into(), &"wasps".into(), &2.into())
     );
     assert!(place["median_s"].as_f64().unwrap() > 5.0, "{place}");
-    // All that is kept of a team is its own to have, the signed grade among it, and to have erased.
+    // A team's stored data can be exported, including the signed grade, and erased.
     let kept: Value =
         serde_json::from_str(&leaderboard(rig, &["team", "export", "wasps"]).unwrap()).unwrap();
     let exported = rig.at("exported.json");
@@ -538,14 +537,14 @@ fn on_the_leaderboard(rig: &Rig, whole: &str, part: &str) {
 }
 
 #[test]
-fn the_race_is_flown_from_images_and_refused_without_depth() {
+fn race_plugin_flies_with_depth_images_and_fails_without() {
     let rig = Rig::new();
     let race = ["race", "--project=p5", "--seeds=1", "--json"];
     let grade = rig.grade(&race);
     let run = &grade["runs"][0];
     assert_eq!(run["outcome"], "finished", "{run}");
     assert_eq!(run["stages_passed"], 4, "{run}");
-    // Colour alone: it reports so before it takes off, and what it needs.
+    // Colour only: the plugin fails before take-off with the reason.
     let grade = rig.grade(&[&race[..], &["--level=g"]].concat());
     let run = &grade["runs"][0];
     assert_eq!(run["outcome"], "plugin_failed", "{run}");
@@ -554,14 +553,14 @@ fn the_race_is_flown_from_images_and_refused_without_depth() {
 }
 
 #[test]
-fn the_known_map_is_flown_by_points() {
+fn flies_the_known_map_with_position_setpoints() {
     let rig = Rig::new();
-    // The example asks for velocities where it may, and for points here.
+    // This project accepts only position setpoints; elsewhere the example uses velocities.
     let grade = rig.grade(&["avoid", "--project=p2", "--seeds=1", "--image-rate=15", "--json"]);
     assert_eq!(grade["runs"][0]["outcome"], "finished", "{grade}");
 }
 
-/// Writes a plugin that is a shell script, and returns its path.
+/// Writes a plugin as a shell script; returns its path.
 fn script(rig: &Rig, name: &str, text: &str) -> String {
     use std::os::unix::fs::PermissionsExt;
     let path = rig.at(name);
@@ -571,7 +570,7 @@ fn script(rig: &Rig, name: &str, text: &str) -> String {
 }
 
 #[test]
-fn a_plugin_that_fails_is_graded_and_explained() {
+fn failing_plugin_is_graded_with_its_cause() {
     let rig = Rig::new();
     let broken = script(&rig, "broken", "echo no such model >&2; exit 3");
     let (report, junit) = (rig.at("report"), rig.at("junit.xml"));
@@ -601,7 +600,7 @@ fn a_plugin_that_fails_is_graded_and_explained() {
 }
 
 #[test]
-fn weather_is_flown_the_same_again_and_what_is_drawn_is_written_down() {
+fn weather_variants_are_reproducible_and_recorded() {
     let rig = Rig::new();
     let flown = |jobs| {
         let variants = "--variants=night-rain,random:1";
@@ -609,7 +608,7 @@ fn weather_is_flown_the_same_again_and_what_is_drawn_is_written_down() {
         rig.grade(&[&forest[..], &[variants, jobs]].concat())
     };
     let one = flown("--jobs=1");
-    assert_eq!(one, flown("--jobs=2"), "bits do not depend on what flies beside it");
+    assert_eq!(one, flown("--jobs=2"), "bits do not depend on parallel flights");
     let variants = one["by_variant"].as_array().unwrap();
     let names: Vec<_> = variants.iter().map(|variant| &variant["variant"]).collect();
     assert_eq!(names, ["night-rain", "random-01"]);
@@ -626,13 +625,13 @@ fn weather_is_flown_the_same_again_and_what_is_drawn_is_written_down() {
 }
 
 #[test]
-fn invalid_arguments_are_refused_before_any_flight() {
+fn rejects_invalid_arguments_before_any_flight() {
     let rig = Rig::new();
     rig.refused(&["avoid", "--project=p9"], "p2, p3");
     rig.refused(&["avoid", "--variants=noon"], "noon");
     rig.refused(&["avoid", "--variants=day,day"], "twice");
     rig.refused(&["avoid", "--variants=random:0"], "give random:1 to random:40");
-    rig.refused(&["avoid", "--shard=3/2"], "is no part");
+    rig.refused(&["avoid", "--shard=3/2"], "is not a shard");
     rig.refused(&["avoid", "--image-rate=0"], "1 to 200 Hz");
     rig.refused(&["./gone.py"], "there is no plugin");
     rig.refused(&["verify", &rig.at("gone.json")], "cannot read");
@@ -640,7 +639,7 @@ fn invalid_arguments_are_refused_before_any_flight() {
     rig.refused(&["verify", &rig.at("noise.json")], "is not a grade");
 }
 
-/// Returns the code block of this language in the guide to clusters.
+/// Returns the code block of this language in the guide about clusters.
 fn block(language: &str) -> String {
     let guide = fs::read_to_string(root().join("docs/guides/grading-at-scale.md")).unwrap();
     let begin = guide.split_once(&format!("```{language}\n")).unwrap().1;
@@ -664,7 +663,7 @@ fn called(rig: &Rig, shell: &[&str], environment: &[(&str, &str)]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// Whether the program takes these arguments, judged by its message about a project that does not exist.
+/// Returns whether the program accepts these arguments, by its message about a missing project.
 fn is_understood(rig: &Rig, called: &str) -> bool {
     let given = called.trim().replace("--project p5", "--project p9");
     let args: Vec<&str> = given.split_whitespace().collect();
@@ -673,10 +672,10 @@ fn is_understood(rig: &Rig, called: &str) -> bool {
     String::from_utf8_lossy(&output.stderr).contains("there is no project 'p9'")
 }
 
-/// The example plugin's acceptance: at least 18 of 20 generated forests are flown without touching the true
-/// geometry, at 2 m/s or more on the mean.
+/// Acceptance test of the example plugin: at least 18 of 20 generated forests are flown without touching the true
+/// geometry, at a mean speed of at least 2 m/s.
 #[test]
-fn the_example_flies_twenty_forests() {
+fn example_flies_twenty_forests() {
     let grade = Rig::new().grade(&["avoid", "--project=forest", "--seeds=20", "--json"]);
     let runs = grade["runs"].as_array().unwrap();
     assert_eq!(runs.len(), 20);
@@ -691,7 +690,7 @@ fn the_example_flies_twenty_forests() {
 }
 
 #[test]
-fn the_array_script_of_the_guide_flies_its_part() {
+fn array_script_of_the_guide_flies_its_shard() {
     let rig = Rig::new();
     let file = script(&rig, "grade.sh", "");
     fs::write(&file, block("bash")).unwrap();
@@ -712,7 +711,7 @@ fn the_array_script_of_the_guide_flies_its_part() {
 }
 
 #[test]
-fn the_job_of_the_guide_flies_every_part() {
+fn job_of_the_guide_flies_every_shard() {
     let rig = Rig::new();
     fs::write(rig.at("job.yaml"), block("yaml")).unwrap();
     let convert = "import json, sys, yaml; print(json.dumps(yaml.safe_load(open(sys.argv[1]))))";
@@ -726,7 +725,7 @@ fn the_job_of_the_guide_flies_every_part() {
     let parts = spec["completions"].as_u64().unwrap();
     let pod = &spec["template"]["spec"];
     assert_eq!(pod["restartPolicy"], "Never");
-    // Every mount has its volume.
+    // Every mount needs its volume.
     let named = |list: &Value| -> Vec<String> {
         let items = list.as_array().unwrap().iter();
         items.map(|item| item["name"].as_str().unwrap().to_owned()).collect()

@@ -1,4 +1,4 @@
-//! An arena.toml: an error or an arena that the runtime's and the server's types accept.
+//! arena.toml: an error, or an arena that the types of runtime and server accept.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_arena::config::line_of;
@@ -19,11 +19,11 @@ fuzz_target!(|text: &str| {
             assert!(placements.iter().flatten().all(Pose::is_valid));
         }
     }
-    // The tables that the arena leaves to the server.
+    // Tables that only the server reads.
     if let Ok(sources) = settings::read_all(text) {
         assert!(sources.len() <= settings::MAX_SOURCES);
     }
-    // Keys are looked up in texts that are no arena, too.
+    // Key lookup must also work in texts that are not an arena.
     for key in ["stages[0].name", "objects[1].motion.axis", "[[", "name.name"] {
         assert!(line_of(text, key).is_none_or(|line| line <= text.matches('\n').count() + 1));
     }

@@ -1,5 +1,5 @@
-//! The simulated autopilot's MAVLink side: any bytes on any of its links, in order, over a cable or
-//! Wi-Fi, with time going on and things breaking.
+//! MAVLink input of the simulated autopilot: any bytes on any of its links, over a cable or Wi-Fi, with time steps and
+//! failures.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::mavlink::dialect::MavMessage;
@@ -11,7 +11,7 @@ use vizflyt_simulator::wifi::WifiConfig;
 /// The mission protocol: MISSION_COUNT, ITEM_INT, ACK, REQUEST_INT, REQUEST_LIST, CLEAR_ALL.
 const MISSION: [u32; 6] = [44, 73, 47, 51, 43, 45];
 
-/// Says a whole message of the mission protocol with this payload.
+/// Sends a complete message of the mission protocol with this payload.
 fn inject(simulation: &mut Simulation, which: u8, payload: &[u8]) {
     let id = MISSION[usize::from(which) % MISSION.len()];
     let Ok(message) = MavMessage::parse(MavlinkVersion::V2, id, payload) else { return };

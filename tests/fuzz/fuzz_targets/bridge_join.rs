@@ -1,5 +1,4 @@
-//! What a bridge answers to those who join its network: DHCP requests and questions for its name.
-//! Never a panic; answers are of the right length and never for another's name.
+//! DHCP requests and mDNS queries to a bridge: no panic; responses have a valid length and only the bridge's own name.
 #![no_main]
 use std::net::Ipv4Addr;
 

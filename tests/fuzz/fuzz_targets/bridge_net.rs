@@ -1,6 +1,5 @@
-//! The bridge's network side: datagrams of several senders, a TCP stream, requests for its
-//! configuration with and without the key, time going on. Never a panic; its settings change only
-//! by the key.
+//! Network side of the bridge: datagrams of several senders, a TCP stream, configuration requests with and without the
+//! key, time steps. No panic; settings change only with the key.
 #![no_main]
 use std::net::{Ipv4Addr, SocketAddrV4};
 
@@ -16,9 +15,9 @@ use vizflyt_protocol::time::HostTime;
 #[derive(Arbitrary, Debug)]
 enum Step<'a> {
     Datagram(u8, &'a [u8]),
-    /// A packet of this message with this payload, whole and right.
+    /// A valid packet with this message id and payload.
     Packet(u8, u16, &'a [u8]),
-    /// A request for the configuration, proven by the key or not.
+    /// A configuration request, with or without a proof by the key.
     Request(&'a [u8], bool),
     Stream(u8, &'a [u8]),
     Open(u8),

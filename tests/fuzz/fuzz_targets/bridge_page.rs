@@ -1,5 +1,5 @@
-//! The bridge's page: requests of any bytes in any portions, forms among them. Never a panic; memory is
-//! bounded; settings change by the key alone, and what is shown of them is no markup.
+//! Page of the bridge: requests with any bytes in any portions, including forms. No panic; bounded memory; settings
+//! change only with the key, and are never rendered as markup.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_bridge::http::{Progress, Request};

@@ -1,5 +1,4 @@
-//! What a bridge answers besides MAVLink: requests for an address and for its name; and firmware that is
-//! offered to it. Its page has a target of its own.
+//! Other services of the bridge: DHCP, mDNS, and offered firmware. Its page has a separate target.
 #![no_main]
 use std::net::Ipv4Addr;
 
@@ -18,7 +17,7 @@ fuzz_target!(|datagrams: Vec<&[u8]>| {
             assert!(len <= mdns::ANSWER);
         }
         if let Some(head) = bytes.first_chunk::<HEADER>() {
-            // Nobody signs by chance.
+            // A random signature is never valid.
             let opened = Header::open(head, &[9; 32]);
             assert!(matches!(opened, Err(Fault::NoFirmware | Fault::Signature)));
         }

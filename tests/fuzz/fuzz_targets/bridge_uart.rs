@@ -1,5 +1,5 @@
-//! The bridge's serial side: any bytes in any portions at any time, while a client listens. What
-//! comes out is whole packets that came in, and nothing is lost without being counted.
+//! Serial side of the bridge: any bytes in any portions at any time, while a client is connected. The output consists
+//! of complete packets from the input, and each loss is counted.
 #![no_main]
 use std::net::{Ipv4Addr, SocketAddrV4};
 
@@ -24,7 +24,7 @@ fuzz_target!(|portions: Vec<(u8, &[u8])>| {
             assert!(len <= 1400);
             let mut cut = CutStats::default();
             each_in_datagram(&out[..len], &mut cut, |packet| {
-                // What is not ours came from the line.
+                // Packets of other components came from the line.
                 foreign += u32::from(packet.source().1 != 240);
             });
             assert!(cut.packets > 0 && cut.dropped_bytes == 0);

@@ -1,4 +1,4 @@
-//! COLMAP's files, text and binary, from a stranger: an error in words, or a model of finite numbers.
+//! Untrusted COLMAP files, text and binary: an error, or a model with finite values.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_twin::dataset::colmap::{Cameras, binary, text};

@@ -1,5 +1,4 @@
-//! SuperSplat's compressed PLY from a stranger: an error or a sound scene. Seeds lead here; the
-//! plain PLY has a target of its own.
+//! Untrusted compressed PLY (SuperSplat): an error or a valid scene. The plain PLY has a separate target.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_splat::format::{Format, parse};

@@ -1,4 +1,4 @@
-//! The control stream of both sides: framing and messages.
+//! Control streams of both sides: framing and messages.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::messages::{FromPlugin, ToPlugin, ToRuntime, ToServer};

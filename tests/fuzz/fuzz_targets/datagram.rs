@@ -1,4 +1,4 @@
-//! Datagrams of the server: what a runtime decodes without any framing.
+//! Datagrams of the server, which a runtime decodes without framing.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::messages::Datagram;

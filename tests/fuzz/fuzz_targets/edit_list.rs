@@ -1,4 +1,4 @@
-//! A list of edits: an error, or steps that are written as they were read and take away what they say they do.
+//! Edit list: an error, or steps that are written as they were read and remove the stated number of splats.
 #![no_main]
 use glam::{Quat, Vec3};
 use libfuzzer_sys::fuzz_target;
@@ -11,7 +11,7 @@ fuzz_target!(|text: &str| {
     assert_eq!(EditList::parse(&list.to_toml()), Ok(list.clone()));
     let mut splats = scene();
     for done in list.steps.iter().take(8) {
-        // A fine grid takes seconds.
+        // A fine grid takes seconds, so it is skipped.
         let is_coarse = |carve: &Carve| {
             let all = carve.path.iter().flatten().chain([&carve.reach]);
             all.into_iter().all(|v| (v / carve.cell).abs() < 25.0)
@@ -27,7 +27,7 @@ fuzz_target!(|text: &str| {
     }
 });
 
-/// A few splats of every kind.
+/// Returns a few splats of every kind.
 fn scene() -> Splats {
     let count = 40;
     let even = |k: usize, root: f32| (k as f32 * root).fract();

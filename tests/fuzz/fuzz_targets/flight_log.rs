@@ -1,4 +1,4 @@
-//! Flight logs: any file is read as far as it goes; any recorded observation is decoded, or not.
+//! Flight logs: any file is read up to its first error; any recorded observation is decoded or rejected.
 #![no_main]
 use std::collections::HashMap;
 use std::io::Cursor;
@@ -10,7 +10,7 @@ use vizflyt_runtime::log::{Observation, ObservedImage};
 use vizflyt_runtime::replay::{ReplayPlan, decode, observation_len};
 use zerocopy::IntoBytes;
 
-/// Larger ones are for the machine that replays, not for the fuzzer.
+/// Maximum size of an observation: larger ones take too long.
 const LARGEST: usize = 1 << 22;
 
 fn feed(observation: &Observation) {
@@ -23,7 +23,7 @@ fn feed(observation: &Observation) {
 
 fuzz_target!(|bytes: &[u8]| {
     if bytes.starts_with(b"VZOB") {
-        // Past the container: a head, and an image's bitstream behind it.
+        // Without the container: a head followed by an image's bitstream.
         for image_at in (0..bytes.len()).filter(|at| bytes[*at..].starts_with(b"VZRD")).take(4) {
             let (head, bitstream) = bytes.split_at(image_at);
             let image = ObservedImage { bitstream: bitstream.to_vec(), ..ObservedImage::default() };

@@ -1,10 +1,10 @@
-//! A glTF scene from a stranger: an error or a sound scene. The first byte selects whether the others are the whole file,
-//! or the JSON beside a good scene's buffer.
+//! Untrusted glTF scene: an error or a valid scene. The first byte selects whether the others are the complete file, or
+//! the JSON before a valid scene's buffer.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_splat::format::{Format, parse};
 
-/// More than the smallest file may hold.
+/// More splats than the smallest file may hold.
 const MAX_SPLATS: usize = 1 << 20;
 
 const GOOD: &[u8] =

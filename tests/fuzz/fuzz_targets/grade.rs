@@ -1,5 +1,5 @@
-//! Grades, as `vizflyt grade verify` and `merge` read them, and records of flights, as `--resume` does: nothing counts
-//! that was not signed as it is.
+//! Grades as read by `vizflyt grade verify` and `merge`, and flight records as read by `--resume`: only unchanged
+//! signed data is valid.
 #![no_main]
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use vizflyt_grading::document::{DelaysMs, Grade};
 use vizflyt_grading::merge::merge;
 use vizflyt_grading::record::{FlightRecord, FlownWith, SealingKey};
 
-/// A record of a flight: whatever it says, only our own counts, and only whole.
+/// Checks a flight record: only an unchanged record with our own key is valid.
 fn record(text: &str, read: &Grade) {
     let sealing = |byte| SealingKey::of(&SigningKey::from_bytes(&[byte; 32]));
     let (own, other) = (sealing(7), sealing(8));
@@ -21,7 +21,7 @@ fn record(text: &str, read: &Grade) {
     let record = FlightRecord::new(with.clone(), run, text.to_owned(), read.files.clone());
     let sealed = record.to_text(&own).unwrap();
     assert!(FlightRecord::parse(&sealed, &other, &with).is_err());
-    // Numbers beyond all that is flown have no text.
+    // Values beyond all limits cannot be written as text.
     if let Ok(found) = FlightRecord::parse(&sealed, &own, &with) {
         assert_eq!((&found.run, &found.card), (&record.run, &record.card));
     }
@@ -46,7 +46,7 @@ fuzz_target!(|text: &str| {
     let Ok(read) = Grade::parse(text) else { return };
     record(text, &read);
     let key = SigningKey::from_bytes(&[7; 32]);
-    // Nobody has our key: what comes from outside does not count.
+    // Data from outside is never signed with our key.
     let public = SigningKey::from_bytes(&[8; 32]).verifying_key();
     assert!(read.verify(&public).is_err());
     let mut own = Grade::new(read.subject.clone(), read.shard, read.runs.clone());
@@ -54,11 +54,11 @@ fuzz_target!(|text: &str| {
     own.sign(&key).unwrap();
     own.verify(&key.verifying_key()).unwrap();
     let _ = own.median_finish_s();
-    // With another hash it does not count, however it is spelt.
+    // A changed hash is never valid.
     let mut changed = own.clone();
     changed.hash.push('0');
     assert!(changed.verify(&key.verifying_key()).is_err());
-    // Parts: a grade merges alone or reports why not, and never with itself.
+    // A complete grade can be merged on its own or gives an error, and never together with itself.
     let name = || "grade".to_owned();
     if let Ok(whole) = merge(&[(name(), own.clone())], &key.verifying_key()) {
         assert_eq!(whole.runs.len(), own.runs.len());

@@ -1,5 +1,5 @@
-//! What a guardian takes: packets of a runtime, bytes of an autopilot, datagrams of the pose feed, in any order.
-//! Nothing of it makes it fail, or keeps it for ever.
+//! Input of a guardian: packets of a runtime, bytes of an autopilot, datagrams of the pose feed, in any order. The
+//! guardian never fails, and ends in time.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_guardian::port::Wanted;
@@ -24,7 +24,7 @@ fuzz_target!(|bytes: &[u8]| {
     let mut now = HostTime::from_ns(1_000_000_000);
     let (mut watch, mut sent) = (Watch::new(now, Wanted::default()), Sent(0));
     let (key, mut rest) = ([7; 32], bytes);
-    // One byte for where it comes from and how long after, one for its length.
+    // One byte for source and delay, one for the length.
     while let [what, len, tail @ ..] = rest {
         let (part, after) = tail.split_at(usize::from(*len).min(tail.len()));
         rest = after;
@@ -48,5 +48,5 @@ fuzz_target!(|bytes: &[u8]| {
     }
     watch.handle_end();
     watch.handle_timeout(now, &mut sent);
-    assert!(watch.is_over(now.plus_seconds(60.0)), "it does not stay for ever");
+    assert!(watch.is_over(now.plus_seconds(60.0)), "it does not end");
 });

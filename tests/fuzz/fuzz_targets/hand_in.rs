@@ -1,5 +1,5 @@
-//! Archives that teams hand in, as `vizflyt grade-class` unpacks them: no path leads out of a folder, and what is read is
-//! packed and read again.
+//! Archives handed in by teams, as unpacked by `vizflyt grade-class`: no path leads out of a folder, and packing and
+//! reading again gives the same files.
 #![no_main]
 use std::path::{Component, Path};
 

@@ -1,4 +1,4 @@
-//! Headers of images, observations and sensors' readings from a network and from shared memory.
+//! Headers of images, observations and sensor readings from a network and from shared memory.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, ObservationHeader};
@@ -19,7 +19,7 @@ fuzz_target!(|bytes: &[u8]| {
     {
         assert_eq!(u64::from(found.payload_len.get()), bytes.len() as u64);
     }
-    // Shared memory is aligned; the fuzzer's bytes are not.
+    // Shared memory is aligned, unlike the fuzzer's bytes.
     let mut words = vec![0u64; bytes.len().div_ceil(8)];
     let memory = zerocopy::IntoBytes::as_mut_bytes(words.as_mut_slice());
     memory[..bytes.len()].copy_from_slice(bytes);

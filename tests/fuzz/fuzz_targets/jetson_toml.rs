@@ -1,4 +1,4 @@
-//! A jetson.toml: one sentence, or settings that are written and read again as they are.
+//! jetson.toml: an error message, or settings that are unchanged after writing and reading.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_runtime::config::JetsonConfig;

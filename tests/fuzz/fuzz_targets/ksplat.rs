@@ -1,4 +1,4 @@
-//! A `.ksplat` from a stranger: an error or a sound scene.
+//! Untrusted `.ksplat`: an error or a valid scene.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_splat::format::{Format, parse};

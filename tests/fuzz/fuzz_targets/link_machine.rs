@@ -1,6 +1,5 @@
-//! The link's state machine, by operations: messages of any content, raw bytes, time, goals, poses,
-//! setpoints, parameters. Whatever comes, it arms only for a take-off, sends whole packets of its own,
-//! and always knows when it is due.
+//! State machine of the link, by operations: messages of any content, raw bytes, time, goals, poses, setpoints,
+//! parameters. The link arms only for a take-off, sends only complete packets, and always has a next timeout.
 #![no_main]
 use glam::DVec2;
 use libfuzzer_sys::fuzz_target;
@@ -20,7 +19,7 @@ const MESSAGES: [u32; 23] = [
     51,
 ];
 const GOALS: [Goal; 4] = [Goal::Prepare, Goal::TakeOff(1.0), Goal::Fly, Goal::Land];
-/// As long as no silence is 292 years. [s]
+/// Maximum time; a clock without a limit would overflow after 292 years. [s]
 const LATEST_S: f64 = 1e8;
 
 struct Machine {
@@ -31,7 +30,7 @@ struct Machine {
 }
 
 impl Machine {
-    /// Takes one operation; returns what it leaves of the input.
+    /// Runs one operation; returns the rest of the input.
     fn step<'a>(&mut self, data: &'a [u8]) -> &'a [u8] {
         let [kind, value, length, rest @ ..] = data else { return &[] };
         let (argument, rest) = rest.split_at(rest.len().min(usize::from(*length)));
@@ -76,7 +75,7 @@ impl Machine {
         rest
     }
 
-    /// A whole packet with this payload; the sender is the autopilot, or now and then another.
+    /// Sends a complete packet with this payload, mostly from the autopilot.
     fn inject(&mut self, value: u8, payload: &[u8]) {
         let id = MESSAGES[usize::from(value) % MESSAGES.len()];
         let Ok(message) = MavMessage::parse(MavlinkVersion::V2, id, payload) else { return };

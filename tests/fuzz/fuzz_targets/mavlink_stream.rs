@@ -1,4 +1,4 @@
-//! MAVLink bytes from a radio, in any chunks: never a panic, and every byte is accounted for.
+//! MAVLink bytes in chunks of any size: no panic, and every byte is counted.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::mavlink::StreamDecoder;

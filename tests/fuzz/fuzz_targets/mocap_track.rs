@@ -1,4 +1,4 @@
-//! A motion capture's recording from a stranger.
+//! Untrusted recording of a motion capture.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_twin::align::recording;

@@ -1,5 +1,5 @@
-//! NatNet packets after Motive has identified itself: counted and dropped, or a measurement of finite
-//! numbers; and no packet makes us talk without end.
+//! NatNet packets after Motive's identification: counted and dropped, or a measurement with finite values. No packet
+//! causes endless replies.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::time::ServerTime;

@@ -1,4 +1,4 @@
-//! Baked obstacles from a cache that somebody wrote to: an error or a sound field.
+//! Baked obstacles from an untrusted cache: an error or a valid field.
 #![no_main]
 use glam::DVec3;
 use libfuzzer_sys::fuzz_target;
@@ -6,7 +6,7 @@ use vizflyt_arena::DistanceField;
 use vizflyt_server::scene::parse_kept;
 
 fuzz_target!(|bytes: &[u8]| {
-    // With its checksum, and past it: a fuzzer does not find hashes.
+    // With the checksum, and without it, because a fuzzer does not find hashes.
     let _ = parse_kept(bytes);
     let Ok(field) = DistanceField::from_bytes(bytes) else { return };
     let (header, codes, unseen) = field.as_bytes();

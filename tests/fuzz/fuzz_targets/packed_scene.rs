@@ -1,5 +1,5 @@
-//! A packed scene from a stranger: an error, or an image. The checksum of its tables is put right, so that what they say is
-//! read; those of blocks are the stranger's.
+//! Untrusted packed scene: an error, or an image. The checksum of the tables is corrected, so that the tables are read;
+//! the checksums of blocks are not.
 #![no_main]
 use std::io::Cursor;
 
@@ -7,7 +7,7 @@ use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_splat::{Camera, CpuRenderer, Loading, PackedScene, Rasterizer, RgbdImage};
 
-/// Bytes of the header, and those that its checksum covers.
+/// Size of the header, and of the part that its checksum covers. [bytes]
 const HEADER: usize = 48;
 const CHECKED: usize = 40;
 
@@ -34,6 +34,6 @@ fuzz_target!(|bytes: &[u8]| {
         return;
     };
     let camera = Camera::new(Intrinsics::from_horizontal_fov(48, 32, 1.2), Pose::IDENTITY, 0.05);
-    // Damage is told; nothing else is wrong with the camera.
+    // Damaged blocks give an error; the camera is valid.
     let _ = renderer.render(&[], &[camera], &mut [RgbdImage::default()]);
 });

@@ -1,4 +1,4 @@
-//! Pairing: messages of both sides against both state machines, and the files that people edit.
+//! Pairing: messages of both sides to both state machines, and the files that people edit.
 #![no_main]
 use std::time::Instant;
 
@@ -33,7 +33,7 @@ fuzz_target!(|bytes: &[u8]| {
     let mut attempt = None;
     for message in messages::<PairingRequest>(bytes) {
         match attempt.take() {
-            // The code is in the code above, but a proof is a hash over a fresh half of ours.
+            // The code is known here, but a proof is a hash over our new random share.
             Some(begun) => assert!(server.confirm(now, begun, &message).is_err()),
             None => attempt = server.begin(now, &message, &binding).ok().map(|(begun, _)| begun),
         }

@@ -1,4 +1,4 @@
-//! A splat PLY from a stranger: an error or splats that a renderer can take; bounded memory.
+//! Untrusted splat PLY: an error or splats valid for a renderer; bounded memory.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 

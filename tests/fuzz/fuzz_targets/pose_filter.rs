@@ -1,6 +1,5 @@
-//! The pose filter, by operations: poses of several sources with any sigma, stamps of the past and
-//! of the future, an IMU, silence. Whatever comes: every number that leaves is one to work with,
-//! stamps do not go back, what is rejected is counted, and it always knows when it is due.
+//! Pose filter, by operations: poses of several sources with any sigma, stamps in the past and in the future, an IMU,
+//! silence. All outputs are finite, stamps do not decrease, rejections are counted, and there is always a next timeout.
 #![no_main]
 use glam::DQuat;
 use libfuzzer_sys::fuzz_target;
@@ -17,7 +16,7 @@ impl Input<'_> {
         Some(first)
     }
 
-    /// A usual number, or any there is.
+    /// Reads a number in the usual range, or any floating-point number.
     fn number(&mut self, usual: f64) -> Option<f64> {
         let kind = self.byte()?;
         if kind < 250 {
@@ -83,7 +82,7 @@ impl Machine {
         let Some(newest) = self.filter.newest().copied() else { return Some(()) };
         assert!(newest.is_valid(), "{newest:?}");
         assert!(before.is_none_or(|before| newest.stamp >= before), "{before:?} {newest:?}");
-        // Readings of the IMU wait until a pose is asked for: several at once, too.
+        // IMU readings are processed when a pose is requested: let several accumulate.
         if kind != 2 {
             let soon = self.filter.predict(self.now).unwrap();
             assert!(soon.is_valid(), "{soon:?}");
@@ -98,7 +97,7 @@ impl Machine {
     }
 }
 
-/// Of any length; mostly one to work with.
+/// Returns a quaternion of any length, usually valid.
 fn quaternion([x, y, z]: [f64; 3]) -> DQuat {
     DQuat::from_xyzw(x, y, z, 1.0)
 }

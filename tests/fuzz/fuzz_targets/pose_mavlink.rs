@@ -1,5 +1,5 @@
-//! Datagrams of an autopilot whose estimate is the localization: counted and dropped, or a measurement
-//! of finite numbers. Messages are made of the fuzzer's bytes with a checksum that holds.
+//! Datagrams of an autopilot whose estimate is the localization: counted and dropped, or a measurement with finite
+//! values. Messages consist of the fuzzer's bytes with a valid checksum.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::mavlink::dialect::MavMessage;

@@ -1,4 +1,4 @@
-//! Pose packets in JSON: counted and dropped, or a measurement of finite numbers.
+//! Pose packets in JSON: counted and dropped, or a measurement with finite values.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::time::ServerTime;

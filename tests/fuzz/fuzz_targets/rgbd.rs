@@ -1,4 +1,4 @@
-//! The RGB-D bitstream, whole: an error, or an image of the stated size; bounded time and memory.
+//! Complete RGB-D bitstream: an error, or an image of the stated size; bounded time and memory.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_rgbd::{Decoder, ImageMut, peek};
@@ -6,7 +6,7 @@ use vizflyt_rgbd::{Decoder, ImageMut, peek};
 fuzz_target!(|bytes: &[u8]| {
     let Ok(info) = peek(bytes) else { return };
     let pixels = info.width as usize * info.height as usize;
-    // What the receiver does: it knows the size from the image header and refuses others.
+    // Like the receiver, which knows the size from the image header and rejects others.
     if pixels > 1 << 20 {
         return;
     }
@@ -20,7 +20,7 @@ fuzz_target!(|bytes: &[u8]| {
         ImageMut { rgb: &mut rgb, depth_mm: &mut depth_mm, alpha: &mut alpha, ids: &mut ids };
     let mut decoder = Decoder::new();
     let at_once = decoder.decode_image(bytes, &mut out);
-    // As it arrives: the same end.
+    // Incremental decoding must have the same result.
     decoder.restart();
     let half = decoder.feed(&bytes[..bytes.len() / 2], &mut out);
     let fed = half.and_then(|_| decoder.feed(bytes, &mut out));

@@ -1,5 +1,5 @@
-//! The decoders of the RGB-D parts, past the headers: a true header of a small image in the modes
-//! that the first byte chooses, then any part's bytes.
+//! Decoders of the RGB-D parts without the headers: a valid header of a small image in the modes given by the first
+//! byte, then arbitrary bytes of a part.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_rgbd::depth::{DepthDecoder, scalar};
@@ -41,7 +41,7 @@ fuzz_target!(|bytes: &[u8]| {
     decoder.start(&header).expect("a true header");
     let _ = decoder.push_slice(&slice, &mut out);
 
-    // The fast depth decoder and its reference agree on any bytes.
+    // The fast depth decoder and its reference must agree on any bytes.
     let (mut fast, mut reference) = (vec![0; pixels], vec![0; pixels]);
     let result = DepthDecoder::default().decode(part, width as usize, &mut fast);
     assert_eq!(result, scalar::decode(part, width as usize, &mut reference));

@@ -1,5 +1,5 @@
-//! Messages of a ROS 2 domain, in either byte order: never a panic, never more than their bytes hold, and what counts as a
-//! command is one that the guard takes.
+//! Messages of a ROS 2 domain, in either byte order: no panic, no more data than their bytes hold, and only commands
+//! that the guard accepts.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_ros2::cdr::Reader;

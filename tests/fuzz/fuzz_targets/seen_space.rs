@@ -1,4 +1,4 @@
-//! Seen space from a file that somebody wrote to: an error or sound, and the same bytes again.
+//! Untrusted file of seen space: an error, or valid and written as the same bytes.
 #![no_main]
 use glam::DVec3;
 use libfuzzer_sys::fuzz_target;

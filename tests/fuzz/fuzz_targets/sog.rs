@@ -1,5 +1,5 @@
-//! A SOG scene from a stranger: an error or a sound scene. The first byte selects what of a good scene
-//! is replaced by the others: the whole archive, its meta data, or one of its textures.
+//! Untrusted SOG scene: an error or a valid scene. The first byte selects which part of a valid scene the others
+//! replace: the complete archive, its metadata, or one of its textures.
 #![no_main]
 use std::io::{Cursor, Read as _, Write as _};
 use std::sync::LazyLock;
@@ -9,10 +9,10 @@ use vizflyt_splat::format::{Format, parse};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-/// More than the smallest file may hold.
+/// More splats than the smallest file may hold.
 const MAX_SPLATS: usize = 1 << 20;
 
-/// The parts of a good scene, by name.
+/// Parts of a valid scene, by name.
 static PARTS: LazyLock<Vec<(String, Vec<u8>)>> = LazyLock::new(|| {
     let good = include_bytes!(
         "../../../render-server/splat/tests/data/formats/splat-transform-sog-sh2.sog"

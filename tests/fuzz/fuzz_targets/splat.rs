@@ -1,4 +1,4 @@
-//! A `.splat` from a stranger: an error or a sound scene.
+//! Untrusted `.splat`: an error or a valid scene.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_splat::format::{Format, parse};

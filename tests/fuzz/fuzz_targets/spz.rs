@@ -1,5 +1,5 @@
-//! A `.spz` from a stranger: an error or a sound scene. Most of what arrives as bytes ends at the
-//! gzip stream's checksum, so bytes that look like the inflated stream are also wrapped in one.
+//! Untrusted `.spz`: an error or a valid scene. Most inputs fail the gzip stream's checksum, so the bytes are also used
+//! as the inflated stream.
 #![no_main]
 use std::io::Write as _;
 
@@ -8,7 +8,7 @@ use flate2::write::GzEncoder;
 use libfuzzer_sys::fuzz_target;
 use vizflyt_splat::format::{Format, parse};
 
-/// More than a file of the longest input may inflate to.
+/// More splats than a file of the longest input may inflate to.
 const MAX_SPLATS: usize = 1 << 20;
 
 fuzz_target!(|bytes: &[u8]| {

@@ -1,11 +1,11 @@
-//! The tree of a streamed SOG scene from a stranger: an error or a sound scene, whatever it names of good chunks.
+//! Tree of an untrusted streamed SOG scene with valid chunks: an error or a valid scene.
 #![no_main]
 use std::sync::LazyLock;
 
 use libfuzzer_sys::fuzz_target;
 use vizflyt_splat::format::{Format, FormatError, Loaded, assemble_streamed, parse};
 
-/// As many chunks of 128 splats as a tree of the longest input can name.
+/// Maximum number of splats: chunks of 128 splats that a tree of the longest input can name.
 const MAX_SPLATS: usize = 1 << 20;
 
 static CHUNKS: LazyLock<[Loaded; 2]> = LazyLock::new(|| {

@@ -1,4 +1,4 @@
-//! A camera's file: one sentence, or a camera that is written and read again as it is.
+//! Camera file: an error message, or a camera that is unchanged after writing and reading.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_tags::camera::TagCamera;

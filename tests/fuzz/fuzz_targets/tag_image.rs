@@ -1,4 +1,4 @@
-//! Image files (PNG, JPEG, PGM) and the stamps beside them: images of the stated size, or a sentence.
+//! Image files (PNG, JPEG, PGM) and their stamp files: images of the stated size, or an error message.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_tags::capture::{decode, parse_stamps};
@@ -9,7 +9,7 @@ fuzz_target!(|bytes: &[u8]| {
         Ok(image) => {
             let count = image.width_px() as usize * image.height_px() as usize;
             assert!(count > 0 && image.pixels().len() == count);
-            // A search of a large image takes long, and finds nothing new.
+            // Searching a large image takes long and covers no additional code.
             if count < 40_000 {
                 let board = Checkerboard { columns: 3, rows: 3, square_m: 0.02 };
                 let found = board.find(&image);

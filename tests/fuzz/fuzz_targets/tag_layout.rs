@@ -1,4 +1,4 @@
-//! A layout of tags, or a checkerboard: one sentence, or what is written and read again as it is.
+//! Tag layout or checkerboard: an error message, or data that is unchanged after writing and reading.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_tags::checkerboard::Checkerboard;

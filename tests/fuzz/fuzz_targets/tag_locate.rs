@@ -1,4 +1,4 @@
-//! Images to the tag detector and to locating: any pixels, any parts, any expectation of tags. Then the file that
+//! Images for the tag detector and the localization: any pixels, any regions, any expected tags. Also the file that
 //! names cameras and layouts.
 #![no_main]
 
@@ -18,7 +18,7 @@ fuzz_target!(|data: &[u8]| {
     }
     let [width, height, kind, edge, x, y, rest @ ..] = data else { return };
     let (width_px, height_px) = (u32::from(*width), u32::from(*height));
-    // Few bytes make an image, again and again, so that small inputs have structure too.
+    // Repeat the bytes as pixels, so that small inputs have structure.
     let count = (width_px * height_px) as usize;
     let pixels: Vec<u8> = if rest.is_empty() {
         vec![*kind; count]

@@ -1,4 +1,4 @@
-//! Images on a pipe (YUV4MPEG2): the same images however the bytes are cut.
+//! Images on a pipe (YUV4MPEG2): the same images for chunks of any size.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_tags::capture::Y4m;

@@ -1,4 +1,4 @@
-//! A transforms.json from a stranger, and the PLY of points beside it.
+//! Untrusted transforms.json and PLY point cloud.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_twin::dataset::{nerfstudio, point_cloud};

@@ -1,4 +1,4 @@
-//! A training under way from a file that somebody wrote to: an error or sound, and the same bytes again.
+//! Untrusted checkpoint of a training: an error, or valid and written as the same bytes.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_twin::train::Checkpoint;

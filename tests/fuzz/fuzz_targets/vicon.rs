@@ -1,4 +1,4 @@
-//! Vicon datagrams: counted and dropped, or a measurement of finite numbers.
+//! Vicon datagrams: counted and dropped, or a measurement with finite values.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::time::ServerTime;

@@ -1,12 +1,12 @@
-//! A VRPN server's bytes as they come off its connection, cut anywhere: poses of finite numbers, or the connection is given up;
-//! and no stream makes us keep more than a message and what came last.
+//! Byte stream of a VRPN server in chunks of any size: poses with finite values, or the connection is closed. The
+//! buffer is limited to one message and the newest data.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_server::poses::drivers::vrpn::{COOKIE, VrpnStream};
 use vizflyt_server::poses::settings::LocalizationConfig;
 
-// How the stream begins, how it is cut, and the stream.
+// Beginning of the stream, size of its chunks, and the stream.
 fuzz_target!(|input: (u8, u8, &[u8])| {
     let (begins, cut, bytes) = input;
     let (is_greeted, is_described) = (begins & 1 != 0, begins & 2 != 0);

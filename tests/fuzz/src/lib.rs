@@ -1,9 +1,8 @@
-//! What several targets check.
+//! Checks for several targets.
 
 use vizflyt_splat::format::{FormatError, Loaded};
 
-/// Panics if a scene from hostile bytes is not one that a renderer can take, or if it has more
-/// splats than `most`.
+/// Panics if a parsed scene is not valid for a renderer, or if it has more than `most` splats.
 pub fn check_scene(result: Result<Loaded, FormatError>, most: usize) {
     let Ok(loaded) = result else { return };
     let splats = &loaded.splats;

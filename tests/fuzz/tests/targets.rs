@@ -1,7 +1,7 @@
-//! Every parser that is fuzzed is known to cargo.
+//! Every fuzz target is in the manifest.
 //!
-//! `tests/fuzz/run` compiles this beside the targets: asked for a test too, cargo gives dependencies the features that they
-//! have in every other build with tests, and takes what is compiled already.
+//! `tests/fuzz/run` compiles this test together with the targets. With a test, cargo gives dependencies the same
+//! features as in every other build with tests, and reuses what is already compiled.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -14,7 +14,7 @@ fn names(folder: &str) -> BTreeSet<String> {
 }
 
 #[test]
-fn every_target_is_in_the_manifest_and_seeds_are_of_a_target() {
+fn every_target_is_in_the_manifest_and_every_corpus_has_a_target() {
     let targets = names("fuzz_targets");
     let manifest = include_str!("../Cargo.toml");
     let lines = manifest.lines().filter_map(|line| line.strip_prefix("path = \"fuzz_targets/"));

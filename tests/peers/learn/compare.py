@@ -1,8 +1,9 @@
-"""Steps a second of `vizflyt.gym` and of other simulators that learn on a processor, in turns; prints Markdown.
+"""Compares steps per second of `vizflyt.gym` and other simulators for learning on a processor, in alternation; prints
+Markdown.
 
     compare.py FOLDER [--rounds N] [--seconds S] [--only TABLE]
 
-FOLDER has a Python environment for each simulator: `tests/peers/learn/run` makes them. In a round each simulator of a
+FOLDER has a Python environment for each simulator, made by `tests/peers/learn/run`. In a round each simulator of a
 table steps for S seconds, one after the other; a rate is the median over the rounds.
 """
 
@@ -17,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 WORKER = Path(__file__).absolute().with_name("worker.py")
-# What is compared with what: name, vehicles, cores, who flies. The first is ours.
+# Compared configurations: name, vehicles, cores, simulators. The first one is this project's.
 TABLES = {
     "state, one vehicle, one core": (1, 1, [
         "vizflyt race", "vizflyt forest", "gym-pybullet-drones velocity", "gym-pybullet-drones rpm", "pyflyt velocity",
@@ -48,7 +49,7 @@ class Worker:
         python = folder.absolute() / maker.split()[0] / "bin" / "python"
         command = [python, WORKER, maker, str(vehicles), str(cores)]
         self.maker = maker
-        # A group of its own: it ends with all that it has started.
+        # Its own process group: it ends with all its child processes.
         self.process = subprocess.Popen(
             command, cwd=scratch, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
             stderr=None if os.environ.get("VERBOSE") else subprocess.DEVNULL,
@@ -88,7 +89,7 @@ def compare(folder, title, rounds, seconds, scratch):
             workers.append(Worker(folder, maker, vehicles, cores, scratch))
             workers[-1].answer()
         for worker in workers:
-            # A first turn that does not count: caches, compilers.
+            # Warm-up that does not count: caches, compilers.
             worker.turn(0.5)
             worker.turns.clear()
         for _ in range(rounds):
@@ -118,7 +119,7 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--only", choices=TABLES, help="one table of these")
     args = parser.parse_args()
-    # Some simulators leave files where they run.
+    # Some simulators leave files in the working folder.
     with tempfile.TemporaryDirectory() as scratch:
         for title in [args.only] if args.only else TABLES:
             compare(args.folder, title, args.rounds, args.seconds, scratch)

@@ -1,9 +1,9 @@
-"""One simulator, made as asked for, that steps when it is told to; compare.py starts it by that simulator's own Python.
+"""Runs one simulator and steps it on request; compare.py starts it with that simulator's Python.
 
     worker.py MAKER VEHICLES CORES
 
 Each line of standard input is a number of seconds to step for. The answer is a line: steps of one vehicle, seconds,
-seconds of processor of this process and of those that it has started. The first line says what was made.
+processor seconds of this process and its child processes. The first line describes the simulator.
 """
 
 import json
@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 MAKER, VEHICLES, CORES = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-# Before anything starts threads: their number follows from it.
+# Before any library starts threads: their number follows from the affinity.
 os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:CORES])
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
 warnings.simplefilter("ignore")
-# What simulators print is not an answer.
+# Output of the simulators must not mix with the answers.
 ANSWERS = os.fdopen(os.dup(1), "w", buffering=1)
 os.dup2(2, 1)
 
@@ -31,12 +31,12 @@ RANDOM = np.random.default_rng(1)
 
 
 def small(shape):
-    """Random actions that keep a vehicle near where it is."""
+    """Returns small random actions that keep a vehicle near its position."""
     return (0.1 * RANDOM.standard_normal(shape)).clip(-1, 1).astype(np.float32)
 
 
 def many(make, action, async_envs):
-    """Gymnasium's own vectors of single environments: one after the other, or a process each."""
+    """Makes a Gymnasium vector of single environments: sequential, or one process each."""
     import gymnasium
 
     kind: Any = gymnasium.vector.AsyncVectorEnv if async_envs else gymnasium.vector.SyncVectorEnv
@@ -78,12 +78,12 @@ def pybullet_drones(act="vel", obs="kin", hz=40, async_envs=False):
     from gym_pybullet_drones.utils.enums import ActionType, ObservationType
 
     class Hover(HoverAviary):
-        """Its hovering, with images of the kind that its observation space promises: vectors insist on that."""
+        """HoverAviary with images of the type declared in its observation space, which vectors require."""
 
         def _computeObs(self):
             return super()._computeObs().astype(self.observation_space.dtype)
 
-    # In the air, and not at the place 1 m up where an episode is over.
+    # In the air, but not at 1 m height, where an episode is over.
     how = dict(initial_xyzs=np.array([[0.0, 0.0, 0.7]]), ctrl_freq=hz, pyb_freq=240)
     make = lambda: Hover(act=ActionType(act), obs=ObservationType(obs), **how)
     return alone_or_many(make, lambda: small((1, 4)), async_envs)
@@ -94,7 +94,7 @@ def pyflyt(with_camera=False, async_envs=False):
     from PyFlyt.gym_envs.quadx_envs.quadx_hover_env import QuadXHoverEnv
 
     class Seeing(QuadXHoverEnv):
-        """Its hovering, and what its own camera sees once a step."""
+        """QuadXHoverEnv with an image of its own camera in each step."""
 
         observation_space: Any
         state: Any
@@ -113,7 +113,7 @@ def pyflyt(with_camera=False, async_envs=False):
             super().compute_state()
             self.state = {"state": self.state, "rgba": self.env.drones[0].rgbaImg}
 
-    # Flight mode 6: velocities and a turn.
+    # Flight mode 6: velocities and a yaw rate.
     make = lambda: (Seeing if with_camera else QuadXHoverEnv)(flight_mode=6, agent_hz=40)
     return alone_or_many(make, lambda: np.append(small(3), 0.0), async_envs)
 
@@ -151,7 +151,7 @@ MAKERS = {
     "gym-pybullet-drones velocity async": lambda: pybullet_drones(async_envs=True),
     "gym-pybullet-drones rpm": lambda: pybullet_drones("rpm"),
     "gym-pybullet-drones rpm async": lambda: pybullet_drones("rpm", async_envs=True),
-    # It takes images at 24 Hz: at 24 steps a second it draws one a step.
+    # It takes images at 24 Hz: at 24 steps a second it renders one image per step.
     "gym-pybullet-drones image": lambda: pybullet_drones(obs="rgb", hz=24),
     "gym-pybullet-drones image async": lambda: pybullet_drones(obs="rgb", hz=24, async_envs=True),
     "pyflyt velocity": pyflyt,
@@ -165,7 +165,7 @@ MAKERS = {
 
 
 def processor_s():
-    """Seconds of processor of this process and of all that descend from it and still run."""
+    """Returns the processor time of this process and all its running descendants. [s]"""
     parents, spent = {}, {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -191,6 +191,6 @@ for line in sys.stdin:
         step()
         steps += VEHICLES
     print(json.dumps([steps, elapsed_s, processor_s() - spent_s]), file=ANSWERS)
-# How simulators end is not what is measured.
+# Exit at once: the shutdown of the simulators is not measured.
 ANSWERS.flush()
 os._exit(0)

@@ -1,12 +1,12 @@
-//! A generated quarter of a city, of any number of splats: streets, houses with windows, trees.
+//! Generated quarter of a city with any number of splats: streets, houses with windows, trees.
 //!
-//! Splats lie on the surfaces as training leaves them: flat, jittered, overlapping, many faint
-//! ones, of one density everywhere. The same arguments give the same splats.
+//! Splats are on the surfaces like after training: flat, jittered, overlapping, many of them faint, with uniform
+//! density. The same arguments give the same splats.
 
 use glam::{Mat3, Quat, Vec3};
 use vizflyt_splat::Splats;
 
-/// Knuth's MMIX generator; its upper 24 bits.
+/// Knuth's MMIX generator; uses its upper 24 bits.
 pub(crate) struct Random(u64);
 
 impl Random {
@@ -30,12 +30,12 @@ impl Random {
     }
 }
 
-/// What splats lie on.
+/// Surface that is covered with splats.
 #[derive(Clone, Copy)]
 enum Surface {
-    /// A rectangle: middle, half sides.
+    /// Rectangle: centre, half sides.
     Flat { middle: Vec3, u: Vec3, v: Vec3, colour: Vec3, windows: bool },
-    /// A ball of leaves, splats all through it.
+    /// Ball of leaves, filled with splats.
     Leaves { middle: Vec3, radius_m: f32 },
 }
 
@@ -43,7 +43,7 @@ impl Surface {
     fn area_m2(&self) -> f32 {
         match self {
             Self::Flat { u, v, .. } => 4.0 * u.length() * v.length(),
-            // As many splats as three shells of it.
+            // Number of splats of three shells of the ball.
             Self::Leaves { radius_m, .. } => 3.0 * 4.0 * std::f32::consts::PI * radius_m * radius_m,
         }
     }
@@ -57,7 +57,7 @@ pub(crate) fn city(count: usize, blocks: usize, sh_degree: u8) -> Splats {
     let spacing_m = (total_m2 / count as f32).sqrt();
     let mut splats = Splats { sh_degree, ..Splats::default() };
     splats.sh.reserve(count * splats.sh_coefficients() * 3);
-    // A share of each surface, so that the sum is exact.
+    // Cumulative share of each surface, so that the sum is exact.
     let (mut area_m2, mut done) = (0.0, 0);
     for surface in &surfaces {
         area_m2 += surface.area_m2();

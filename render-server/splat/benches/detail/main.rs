@@ -1,13 +1,12 @@
-//! What level of detail saves and costs: time, likeness to full detail, memory, packing.
+//! Benchmark of level of detail: time, similarity to full detail, memory and packing.
 //!
 //! ```text
 //! cargo bench -p vizflyt-splat --bench detail [-- [plot] [SPLATS] [FILTER]]
 //! ```
 //!
-//! Scenes are generated: a quarter of a city at SH degree 0 and 3, and foliage all of which is near,
-//! where nothing can be merged. FILTER keeps the scenes whose name contains it. `plot` renders
-//! `docs/render-cost.svg` instead. Beside the median stands the processor time, divided by the
-//! threads: what the median is where nothing else uses the machine.
+//! Scenes are generated: a quarter of a city at SH degree 0 and 3, and near foliage, where nothing can be merged.
+//! FILTER selects scenes whose name contains it. `plot` writes `docs/render-cost.svg` instead. The processor time
+//! divided by the number of threads is printed next to the median: it is the median on an otherwise idle machine.
 
 mod plot;
 mod scenes;
@@ -20,12 +19,12 @@ use scenes::city::city;
 #[path = "../../tests/lod/likeness.rs"]
 mod likeness;
 
-/// Images of which the median is taken.
+/// Number of images of which the median is taken.
 const IMAGES: usize = 15;
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    // `cargo test` runs benches too, without this flag: nothing to test here.
+    // `cargo test` also runs benches, but without this flag; then nothing is measured.
     if !arguments.iter().any(|argument| argument == "--bench") {
         return;
     }
@@ -56,7 +55,7 @@ fn main() {
     compare("thicket SH0", &|| scenes::thicket(count), &inside);
 }
 
-/// Prints the figures of a scene in full and in adaptive detail.
+/// Prints the results of a scene in full and in adaptive detail.
 fn compare(name: &str, splats: &Splats, views: &[(&str, Camera)]) {
     println!("\n{name}, {} splats", splats.len());
     let mut truth: Vec<(RgbdImage, f64)> = Vec::new();
@@ -86,11 +85,11 @@ fn compare(name: &str, splats: &Splats, views: &[(&str, Camera)]) {
     }
 }
 
-/// Of one camera.
+/// Results of one camera.
 struct Figures {
     median_ms: f32,
     least_ms: f32,
-    /// Of all threads, divided by their number.
+    /// Processor time of all threads, divided by their number. [ms]
     processor_ms: f64,
     image: RgbdImage,
 }
@@ -113,7 +112,7 @@ fn threads() -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }
 
-/// Returns the processor time of all threads so far; 0 where the system does not report it. [ms]
+/// Returns the total processor time of all threads; 0 if the system does not report it. [ms]
 fn processor_ms() -> f64 {
     let tasks = std::fs::read_dir("/proc/self/task").into_iter().flatten();
     let spent_ns = tasks
@@ -122,7 +121,7 @@ fn processor_ms() -> f64 {
     spent_ns.sum::<f64>() * 1e-6
 }
 
-/// Returns the memory in use; 0 where the system does not report it. [MB]
+/// Returns the resident memory; 0 if the system does not report it. [MB]
 fn resident_mb() -> f64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));

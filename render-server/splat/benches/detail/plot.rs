@@ -1,4 +1,4 @@
-//! The cost of an image over the splats that exist, as a picture.
+//! Plot of the cost of an image against the number of splats in the scene.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -8,10 +8,10 @@ use vizflyt_splat::{Camera, CpuRenderer, Detail, Splats};
 use crate::measure;
 use crate::scenes::{self, city::city};
 
-/// Millions of splats at which is measured.
+/// Measured sizes of scenes, in millions of splats.
 const MILLIONS: [f64; 6] = [0.2, 0.5, 1.0, 2.0, 3.5, 5.0];
 
-/// A line of the plot.
+/// Line of the plot.
 struct Series {
     name: &'static str,
     colour: &'static str,
@@ -64,7 +64,7 @@ pub(crate) fn draw() {
     println!("wrote docs/render-cost.svg");
 }
 
-/// Greys and colours that read on white and on black.
+/// Returns the plot, in greys and colours that are readable on white and on black.
 fn svg(series: &[Series], lines: &[Vec<(f64, f64)>]) -> String {
     let greatest_ms = lines.iter().flatten().map(|point| point.1).fold(1.0, f64::max);
     let step_ms = if greatest_ms > 100.0 { 50.0 } else { 20.0 };

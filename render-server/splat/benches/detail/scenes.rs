@@ -1,4 +1,4 @@
-//! Generated scenes, and where they are seen from.
+//! Generated scenes and their camera views.
 
 use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
@@ -21,7 +21,7 @@ pub(crate) fn look(from: DVec3, to: DVec3) -> Camera {
     }
 }
 
-/// Views of a city of 8 x 8 blocks.
+/// Returns views of a city of 8 x 8 blocks.
 pub(crate) fn views() -> Vec<(&'static str, Camera)> {
     vec![
         ("street", look(DVec3::new(-100.0, -20.0, 1.6), DVec3::new(0.0, -18.0, 3.0))),
@@ -35,12 +35,12 @@ pub(crate) fn from_above() -> Camera {
     look(DVec3::new(-10.0, -150.0, 160.0), DVec3::new(0.0, -10.0, 0.0))
 }
 
-/// From the origin along x.
+/// Returns a camera at the origin that looks along x.
 pub(crate) fn ahead() -> Camera {
     look(DVec3::ZERO, DVec3::X)
 }
 
-/// Foliage that fills the view along x: splats of a pixel or two, many layers deep, none far.
+/// Returns foliage that fills the view along x: splats of one or two pixels, many layers deep, none far away.
 pub(crate) fn thicket(count: usize) -> Splats {
     let random = &mut Random::new(3);
     let mut splats = Splats::default();
@@ -56,7 +56,7 @@ pub(crate) fn thicket(count: usize) -> Splats {
     splats
 }
 
-/// A quarter of 200,000 splats ahead of [`quarter_camera`], and the rest of `count` behind it.
+/// Returns a quarter of 200,000 splats in front of [`quarter_camera`], and the rest of `count` behind it.
 pub(crate) fn quarter_and_elsewhere(count: usize) -> Splats {
     const AHEAD: usize = 200_000;
     let mut splats = city(AHEAD.min(count), 3, 0);

@@ -1,11 +1,12 @@
-//! Pass 4: which splats touch which tile, and which of its blocks, each list nearest first.
+//! Pass 4: lists, for each tile, the splats that touch it and their blocks of pixels, from near to far.
 //!
-//! The depth order is cut into slices. Each slice walks its splats from near to far, and appends an entry to the list of
-//! every tile of which the ellipse alpha >= 1/255 touches a block. A slice's list of a tile is made of pieces of two cache
-//! lines, so that it is written once, wherever it ends; then the pieces of a tile are copied next to each other, slice by
-//! slice. Lists come out ordered because slices are, so nothing is sorted per tile.
+//! The depth order is cut into slices. Each slice processes its splats from near to far, and appends an entry to the
+//! list of every tile in which the ellipse alpha >= 1/255 touches a block. A slice's list of a tile consists of
+//! pieces of two cache lines, which are written once and can be anywhere in memory. Then the pieces of a tile are
+//! copied next to each other, slice by slice. Lists are in depth order because slices are, so no sorting per tile is
+//! needed.
 //!
-//! Budget: 8 bytes read per splat in random order, 64 of a large one (hence the prefetch); 16 written per pair.
+//! Budget: 8 bytes read per splat in random order, 64 for a large one (therefore the prefetch); 16 written per pair.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -18,38 +19,38 @@ use super::simd::{Kernel, Simd};
 
 /// Side of a tile. [px]
 pub(super) const TILE: usize = 16;
-/// Near slices hold the large splats: several per thread even the load.
+/// Near slices contain the large splats: several slices per thread balance the load.
 const SLICES_PER_THREAD: usize = 4;
 const MAX_SLICES: usize = 32;
 const MIN_SLICE: usize = 1024;
-/// Entries of a piece: two cache lines.
+/// Entries per piece: two cache lines.
 const PIECE: usize = 16;
-/// No piece.
+/// Marks the absence of a piece.
 const NONE: u32 = u32::MAX;
-/// How far ahead a splat's record is asked for, and twice as far its cover: some 300 ns of work.
+/// Prefetch distance of a splat's record, and twice of its cover: about 300 ns of work.
 const PREFETCH: usize = 16;
 
-/// Lists of slots per tile.
+/// Lists of splat slots per tile.
 #[derive(Debug, Default)]
 pub(super) struct Bins {
     pub(super) tiles_x: usize,
     pub(super) tiles_y: usize,
     slices: Vec<Slice>,
-    /// Where each tile's list starts; one more than there are tiles.
+    /// Start of each tile's list, and the end of the last list.
     starts: Vec<u32>,
     entries: Vec<AtomicU64>,
 }
 
-/// A splat of a tile's list.
+/// Splat in the list of a tile.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Entry {
     pub(super) slot: usize,
-    /// The blocks it touches, by column, then band, the first lowest.
+    /// Blocks that the splat touches, by column, then band, the first in the lowest bit.
     pub(super) blocks: u32,
 }
 
 impl Entry {
-    /// Takes an entry of [`Bins::list`] apart.
+    /// Decodes an entry of [`Bins::list`].
     #[inline(always)]
     pub(super) fn of(entry: &AtomicU64) -> Self {
         let entry = entry.load(Relaxed);
@@ -57,23 +58,23 @@ impl Entry {
     }
 }
 
-/// The lists of one slice.
+/// Lists of one slice.
 #[derive(Debug, Default)]
 struct Slice {
-    /// Piece by piece.
+    /// Entries, piece by piece.
     entries: Vec<u64>,
-    /// Of each piece, which one comes before it in its tile's list.
+    /// Previous piece of each piece in its tile's list.
     before: Vec<u32>,
-    /// How many pieces there are.
+    /// Number of pieces.
     pieces: usize,
-    /// Per tile: where its next entry goes. That piece is never full.
+    /// Per tile: position of the next entry. The piece there is never full.
     next: Vec<u32>,
-    /// Per tile: how many entries its full pieces have.
+    /// Per tile: number of entries in its full pieces.
     full: Vec<u32>,
 }
 
 impl Bins {
-    /// Returns the splats that touch a tile, nearest first, each to be read by [`Entry::of`].
+    /// Returns the splats that touch a tile, from near to far; decode each with [`Entry::of`].
     pub(super) fn list(&self, tile: usize) -> &[AtomicU64] {
         &self.entries[self.starts[tile] as usize..self.starts[tile + 1] as usize]
     }
@@ -96,14 +97,14 @@ impl Bins {
         let tiles = self.tiles_x * self.tiles_y;
         let wanted = rayon::current_num_threads() * SLICES_PER_THREAD;
         let count = (order.len() / MIN_SLICE).clamp(1, wanted.min(MAX_SLICES));
-        // Never fewer than before: their buffers are kept.
+        // Never fewer than before, to keep their buffers.
         if self.slices.len() < count {
             self.slices.resize_with(count, Slice::default);
         }
         let slices = &mut self.slices[..count];
         let tiles_x = self.tiles_x;
         slices.par_iter_mut().enumerate().with_max_len(1).for_each(|(i, slice)| {
-            // Where a window that lies within the last tiles would go on: nothing is ever there.
+            // Extra tiles for windows that start within the last tiles and extend beyond them; they stay empty.
             slice.start(tiles + tiles_x + 2);
             let order = &order[order.len() * i / count..order.len() * (i + 1) / count];
             simd.run(BinSlice { tiles_x, projected, order, slice });
@@ -124,7 +125,7 @@ impl Bins {
             let mut start = starts[tile] as usize;
             for slice in slices {
                 let end = start + slice.len(tile) as usize;
-                // Disjoint from all other places; atomic because no borrow can say so.
+                // Disjoint from all other ranges. Atomic, because the borrow checker cannot prove that.
                 slice.copy(tile, &entries[start..end]);
                 start = end;
             }
@@ -133,7 +134,7 @@ impl Bins {
 }
 
 impl Slice {
-    /// Begins anew, with an empty piece for each tile.
+    /// Clears the slice and gives each tile an empty piece.
     fn start(&mut self, tiles: usize) {
         self.pieces = tiles;
         self.next.clear();
@@ -145,16 +146,16 @@ impl Slice {
         self.make_room(0);
     }
 
-    /// Returns the number of a tile's entries.
+    /// Returns the number of entries of a tile.
     fn len(&self, tile: usize) -> u32 {
         self.full[tile] + self.next[tile] % PIECE as u32
     }
 
-    /// Copies a tile's entries, which are as many.
+    /// Copies the entries of a tile to `to`, which has the same length.
     fn copy(&self, tile: usize, mut to: &[AtomicU64]) {
         let next = self.next[tile] as usize;
         let (mut piece, mut count) = (next / PIECE, next % PIECE);
-        // The last piece is the first that is found.
+        // Starts at the last piece, the only one that the tile refers to.
         loop {
             let (earlier, later) = to.split_at(to.len() - count);
             for (to, &entry) in later.iter().zip(&self.entries[piece * PIECE..]) {
@@ -167,7 +168,7 @@ impl Slice {
         }
     }
 
-    /// Makes room for more entries, each of which may begin a piece.
+    /// Reserves memory for `count` more entries, each of which may start a piece.
     #[inline(always)]
     fn make_room(&mut self, count: usize) {
         let pieces = self.pieces + count;
@@ -179,7 +180,7 @@ impl Slice {
         }
     }
 
-    /// Notes an entry if it has blocks, without a branch that is hard to foretell; there must be room.
+    /// Adds an entry if it has blocks. Branch-free, because the branch is hard to predict. Requires room.
     #[inline(always)]
     fn note(&mut self, tile: usize, slot: u32, blocks: u32) {
         let place = self.next[tile];
@@ -195,7 +196,7 @@ impl Slice {
     }
 }
 
-/// Notes the pairs of one slice.
+/// Adds the pairs of one slice.
 struct BinSlice<'a> {
     tiles_x: usize,
     projected: &'a Projected,
@@ -214,7 +215,7 @@ impl Kernel for BinSlice<'_> {
                 s.prefetch(&projected.covers[ahead.load(Relaxed) as usize]);
             }
             if let Some(ahead) = order.get(i + PREFETCH) {
-                // Of a small splat, what is there already: no branch to foretell.
+                // For a small splat, prefetches a line that is already cached: avoids an unpredictable branch.
                 let ahead = ahead.load(Relaxed) as usize;
                 let is_large = projected.covers[ahead].blocks == 0;
                 s.prefetch(&projected.splats[if is_large { ahead } else { 0 }]);
@@ -242,13 +243,13 @@ impl Kernel for BinSlice<'_> {
     }
 }
 
-/// Notes the pairs of a splat that may touch any number of tiles.
+/// Adds the pairs of a splat that may touch any number of tiles.
 #[inline(always)]
 fn note_large<S: Simd>(s: S, tiles_x: usize, splat: &Splat2d, slot: u32, slice: &mut Slice) {
     let TileBox { left, right, top, bottom } = splat.tiles;
     let columns = usize::from(left)..usize::from(right) + 1;
     let last_row = usize::from(bottom);
-    // A vector of bands is some rows of tiles.
+    // Rows of tiles in a vector of bands.
     let step = S::LANES / cover::bands(S::LANES);
     for row in (usize::from(top)..=last_row).step_by(step) {
         let bands = Bands::new(s, splat, (row * TILE) as f32);
@@ -270,11 +271,11 @@ mod tests {
 
     proptest! {
         #[test]
-        fn pieces_keep_every_entry_that_has_blocks_in_order(
+        fn pieces_keep_entries_with_blocks_in_order(
             noted in prop::collection::vec((0usize..5, 0u32..3), 0..400),
         ) {
             let mut slice = Slice::default();
-            // What an earlier image left behind must not matter.
+            // The content of an earlier image must not matter.
             for _ in 0..2 {
                 slice.start(5);
                 for (slot, &(tile, blocks)) in noted.iter().enumerate() {

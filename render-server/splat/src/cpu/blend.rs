@@ -1,14 +1,15 @@
-//! Pass 5: the pixels of each tile, from near to far.
+//! Pass 5: blends the pixels of each tile from near to far.
 //!
-//! A tile is cut into blocks of one vector (`cover`). Its list is taken in batches of [`BATCH`]: copied
-//! next to each other, and turned into a row of bits per block, of the splats that touch it; then each block runs along
-//! its bits with colour, depths and transmittance in registers, and stops when all its pixels are opaque.
+//! A tile is cut into blocks of one vector (`cover`). Its list is processed in batches of [`BATCH`] splats. A batch
+//! is copied next to each other, and converted to a row of bits per block: the splats that touch it. Each block then
+//! iterates over its bits, with colour, depths and transmittance in registers, and stops when all its pixels are
+//! opaque.
 //!
-//! Transmittance carries the pixel's end in its sign: the splat that would bring a pixel to 1e-4 is
-//! not rendered, and makes it negative from the next batch on. Where depth alone is asked for, a pixel ends once half of its light is gone: neither
-//! median depth nor id changes behind that.
+//! The sign of the transmittance marks the end of a pixel: the splat that would reduce it to 1e-4 is not rendered,
+//! and makes it negative from the next batch on. If only depth is requested, a pixel ends once half of its light is
+//! gone, because neither median depth nor id changes after that.
 //!
-//! Budget: some 26 vector instructions per block and splat; 10 kB of tables, all in the L1 cache.
+//! Budget: about 26 vector instructions per block and splat; 10 kB of tables, all in the L1 cache.
 
 use std::sync::atomic::AtomicU64;
 
@@ -25,29 +26,29 @@ use crate::limits::{ALPHA_MAX, TRANSMITTANCE_MIN};
 
 /// Splats blended at once.
 const BATCH: usize = 64 * WORDS;
-/// Words of a row of bits.
+/// Words in a row of bits.
 const WORDS: usize = 2;
-/// Blocks of a tile at most: 8 lanes, 4x2 pixels.
+/// Maximum number of blocks in a tile: 8 lanes, 4x2 pixels.
 const MAX_BLOCKS: usize = TILE * TILE / 8;
 /// Pixels of a tile.
 const TILE_PIXELS: usize = TILE * TILE;
 /// Red, green, blue, weighted depth, median depth, transmittance, id: per block, vector by vector.
 const CHANNELS: usize = 7;
-/// Numbers of a tile.
+/// Values of a tile.
 const TILE_NUMBERS: usize = CHANNELS * TILE_PIXELS;
-/// How far ahead records of the list are asked for.
+/// Prefetch distance of the list's records.
 const PREFETCH: usize = 12;
 
-/// Which part of the scene a slot is of, and what of it is wanted.
+/// Part of the scene of each slot, and the requested outputs.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Tagged<'a> {
     /// Slots.
     pub(super) splats: &'a [Splat2d],
-    /// What stands still, then the objects.
+    /// Static part, then the objects.
     pub(super) parts: &'a [Part],
-    /// Per region of slots.
+    /// Visible block of each region of slots.
     pub(super) visible: &'a [Visible],
-    /// Median depth and id are all that counts.
+    /// Compute only median depth and id.
     pub(super) depth_alone: bool,
 }
 
@@ -57,7 +58,7 @@ impl Tagged<'_> {
     }
 }
 
-/// Blends all tiles into `image`; `tiles` is kept from image to image.
+/// Blends all tiles into `image`; `tiles` is a buffer that is reused for the next image.
 pub(super) fn blend<S: Simd>(
     simd: S,
     view: &ObjectView,
@@ -88,12 +89,12 @@ struct Scratch {
     splats: [Record; BATCH],
     /// [`Entry::blocks`], byte by byte.
     touched: [[[u8; 64]; WORDS]; 4],
-    /// Per block, which of the splats touch it.
+    /// Splats that touch each block, as bits.
     hits: [[u64; WORDS]; MAX_BLOCKS],
 }
 
-/// A splat, relative to the tile: at pixel (x, y) its level is `level - u^2 - v^2`,
-/// with `u = u_x x + u_y y + u_0` and `v = v_y y + v_0`.
+/// Splat relative to the tile. At pixel (x, y) its level is `level - u^2 - v^2`, with `u = u_x x + u_y y + u_0` and
+/// `v = v_y y + v_0`.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(64))]
 struct Record {
@@ -118,7 +119,7 @@ impl Scratch {
     }
 }
 
-/// One tile.
+/// Blends one tile.
 struct BlendTile<'a> {
     view: &'a ObjectView,
     list: &'a [AtomicU64],
@@ -136,12 +137,12 @@ impl Kernel for BlendTile<'_> {
     fn run<S: Simd>(self, s: S) {
         let Self { view, list, tagged, origin, scratch, pixels } = self;
         let splats = tagged.splats;
-        // Ids cost a twentieth of the pass: only where something moves.
+        // Ids cost a twentieth of the pass, so they are computed only if the scene has objects.
         let has_ids = tagged.parts.len() > 1;
         let pixels = &mut pixels[..TILE_NUMBERS];
         let block_height = block_height(S::LANES);
         let blocks = TILE_PIXELS / S::LANES;
-        // Lane's centre within its block.
+        // Pixel centre of each lane within its block.
         let mut lane_x = [0.0; 16];
         let mut lane_y = [0.0; 16];
         for lane in 0..16 {
@@ -150,7 +151,7 @@ impl Kernel for BlendTile<'_> {
         }
         let (lane_x, lane_y) = (s.load(&lane_x), s.load(&lane_y));
 
-        // Pixels beyond the image's edge have ended before they start.
+        // Pixels beyond the image's edge start as ended.
         let room_x = (view.width_px as usize - origin[0]).min(TILE) as f32;
         let room_y = (view.height_px as usize - origin[1]).min(TILE) as f32;
         let mut live = 0u32;
@@ -247,13 +248,13 @@ fn load_batch<S: Simd>(
     }
 }
 
-/// Turns the blocks of each of `len` splats into the splats of each block.
+/// Converts the blocks of each of `len` splats into the splats of each block.
 #[inline(always)]
 fn find_hits<S: Simd>(s: S, len: usize, blocks: usize, scratch: &mut Scratch) {
     for byte in 0..blocks / 8 {
         for word in 0..WORDS {
             let planes = s.bit_planes(&scratch.touched[byte][word]);
-            // What lies behind the batch's end is of an earlier one.
+            // Entries behind the batch's end are from an earlier batch.
             let count = len.saturating_sub(64 * word).min(64);
             let there = if count == 64 { u64::MAX } else { (1 << count) - 1 };
             for (hits, plane) in scratch.hits[byte * 8..].iter_mut().zip(planes) {
@@ -263,7 +264,7 @@ fn find_hits<S: Simd>(s: S, len: usize, blocks: usize, scratch: &mut Scratch) {
     }
 }
 
-/// Blends the splats of the bits that are set onto one block; returns whether any of its pixels goes on.
+/// Blends the splats whose bits are set onto one block. Returns whether any of its pixels continues.
 #[inline(always)]
 fn blend_block<S: Simd, const DEPTH_ALONE: bool, const IDS: bool>(
     s: S,
@@ -273,7 +274,7 @@ fn blend_block<S: Simd, const DEPTH_ALONE: bool, const IDS: bool>(
     y: S::F,
     state: &mut [f32],
 ) -> bool {
-    // Behind half of the light neither median depth nor id changes any more.
+    // After half of the light, neither median depth nor id changes.
     let transmittance = s.load(&state[5 * S::LANES..]);
     if s.any(s.lt(s.splat(0.5), transmittance)) {
         blend_hits::<S, DEPTH_ALONE, true, IDS>(s, batch, hits, x, y, state)
@@ -299,8 +300,8 @@ fn blend_hits<S: Simd, const DEPTH_ALONE: bool, const MEDIAN: bool, const IDS: b
     let mut transmittance = s.load(&state[5 * S::LANES..]);
     let mut id = s.load(&state[6 * S::LANES..]);
     let end = s.splat(if DEPTH_ALONE { 0.5 } else { TRANSMITTANCE_MIN as f32 });
-    // Goes on falling behind the pixel's end, so that from splat to splat there is but one operation's latency; `shown`
-    // is what it was before the end.
+    // Continues to fall after the pixel's end, so that consecutive splats are only one operation's latency apart.
+    // `shown` is the value before the end.
     let mut shown = transmittance;
     'batch: for (word, mut bits) in hits.into_iter().enumerate() {
         while bits != 0 {
@@ -312,9 +313,9 @@ fn blend_hits<S: Simd, const DEPTH_ALONE: bool, const MEDIAN: bool, const IDS: b
             let level = s.neg_mul_add(u, u, s.neg_mul_add(v, v, s.splat(splat.level)));
             let hit = s.lt(s.splat(MIN_LEVEL), level);
             let alpha = s.keep(hit, s.min(s.exp2(level), s.splat(ALPHA_MAX as f32)));
-            // Not `transmittance - weight`: a latency less.
+            // Not `transmittance - weight`: that adds the latency of one operation.
             let after = s.neg_mul_add(alpha, transmittance, transmittance);
-            // Far behind the end, but no subnormal number, which takes a hundred times as long.
+            // Far below the end, but not subnormal: subnormal numbers are a hundred times slower.
             let after = s.max(after, s.splat(1e-30));
             let live = s.lt(end, after);
             if !DEPTH_ALONE {
@@ -324,8 +325,8 @@ fn blend_hits<S: Simd, const DEPTH_ALONE: bool, const MEDIAN: bool, const IDS: b
                 blue = s.mul_add(weight, s.splat(splat.rgb[2]), blue);
                 depth = s.mul_add(weight, s.splat(splat.z_m), depth);
             }
-            // The last splat rendered while more than half of the light passed; `finish` checks that it
-            // brought the pixel to half.
+            // Last splat that is rendered while more than half of the light is left. `finish` checks that it reduced
+            // the light to half.
             if MEDIAN {
                 let before_half = hit & s.lt(s.splat(0.5), transmittance);
                 median = s.select(before_half, s.splat(splat.z_m), median);
@@ -349,8 +350,7 @@ fn blend_hits<S: Simd, const DEPTH_ALONE: bool, const MEDIAN: bool, const IDS: b
     s.any(live)
 }
 
-/// Turns a block's sums into what an image holds: RGB on the background, expected depth, median
-/// depth, alpha, id.
+/// Converts the sums of a block into image values: RGB on the background, expected depth, median depth, alpha, id.
 #[inline(always)]
 fn finish<S: Simd>(s: S, view: &ObjectView, state: &mut [f32]) {
     let transmittance = s.splat(0.0) - s.negative(s.load(&state[5 * S::LANES..]));
@@ -360,11 +360,11 @@ fn finish<S: Simd>(s: S, view: &ObjectView, state: &mut [f32]) {
         let rgb = s.mul_add(transmittance, s.splat(view.background[channel]), sum);
         s.store(rgb, &mut state[channel * S::LANES..]);
     }
-    // What rounding brings beyond the greatest number comes back.
+    // Limits values that rounding increased beyond the maximum of f32.
     let depth = s.min(s.load(&state[3 * S::LANES..]) / alpha, s.splat(f32::MAX));
     let covered = s.lt(s.splat(0.0), alpha);
     s.store(s.keep(covered, depth), &mut state[3 * S::LANES..]);
-    // Half itself counts as reached.
+    // Exactly half counts as reached.
     let reached = s.lt(transmittance, s.splat(0.5 + f32::EPSILON / 2.0));
     let median = s.load(&state[4 * S::LANES..]);
     s.store(s.keep(reached, median), &mut state[4 * S::LANES..]);

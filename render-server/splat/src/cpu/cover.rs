@@ -1,10 +1,10 @@
-//! Which blocks of pixels an ellipse alpha >= 1/255 touches: blending evaluates a splat on no others.
+//! Blocks of pixels that an ellipse alpha >= 1/255 touches: blending evaluates a splat only on them.
 //!
-//! A block is one vector of pixels: 4 wide, 2 or 4 high (squarer than a row, so fewer lanes are spent outside the
-//! ellipse); a tile has 4 columns of 8 or 4 bands of them. They are counted and kept as bits column by column. Where a
-//! splat fits into as many blocks as a tile has, projection finds them for a vector of splats at once ([`window`]), and
-//! binning shifts them to where the tiles lie. Of a larger splat binning finds them for a vector of bands at once
-//! ([`Bands`]). Both ask [`Ellipse::span`].
+//! A block is one vector of pixels: 4 wide, 2 or 4 high (squarer than a row, so that fewer lanes are outside the
+//! ellipse). A tile has 4 columns of 8 or 4 bands of blocks. Blocks are numbered, and stored as bits, column by
+//! column. If a splat fits into as many blocks as a tile has, projection finds its blocks for a vector of splats at
+//! once ([`window`]), and binning shifts them to the tiles. For a larger splat, binning finds the blocks for a vector
+//! of bands at once ([`Bands`]). Both use [`Ellipse::span`].
 
 use super::bin::TILE;
 use super::project::{MIN_LEVEL, Splat2d};
@@ -15,7 +15,7 @@ pub(super) const BLOCK_WIDTH: usize = 4;
 /// Blocks across a tile.
 pub(super) const COLUMNS: usize = TILE / BLOCK_WIDTH;
 
-/// Height of a block for vectors of so many lanes. [px]
+/// Height of a block for vectors of `lanes` lanes. [px]
 pub(super) const fn block_height(lanes: usize) -> usize {
     lanes / BLOCK_WIDTH
 }
@@ -25,26 +25,27 @@ pub(super) const fn bands(lanes: usize) -> usize {
     TILE / block_height(lanes)
 }
 
-/// The blocks of a splat that fits into a window of a tile's size; it starts anywhere.
+/// Blocks of a splat that fits into a window of a tile's size. The window can start at any block.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C)]
 pub(super) struct Cover {
-    /// The window's first column of blocks, from the image's left.
+    /// First column of blocks of the window, from the left of the image.
     pub(super) left: u16,
-    /// Its first band, from the image's top.
+    /// First band of the window, from the top of the image.
     pub(super) top: u16,
-    /// By column, then band, the first lowest; 0 where the splat is larger.
+    /// Bits by column, then band, the first in the lowest bit; 0 if the splat is larger than a window.
     pub(super) blocks: u32,
 }
 
 impl Cover {
-    /// Returns the blocks in the tile of the window's first block, in those right of it and below it, and in the fourth.
+    /// Returns the blocks in the tile of the window's first block, in the tile right of it, in the tile below it, and
+    /// in the diagonal one.
     #[inline(always)]
     pub(super) fn split(self, lanes: usize) -> [u32; 4] {
         let bands = bands(lanes);
         let (x, y) = (usize::from(self.left) % COLUMNS, usize::from(self.top) % bands);
         let tile = u64::from(u32::MAX) >> (32 - COLUMNS * bands);
-        // Each column's bands that stay in the first tile.
+        // Bands of each column that are in the first tile.
         let stay = tile / ((1 << bands) - 1) * ((1 << (bands - y)) - 1);
         let blocks = u64::from(self.blocks);
         let upper = (blocks & stay) << y << (bands * x);
@@ -54,7 +55,7 @@ impl Cover {
     }
 }
 
-/// Ellipses alpha >= 1/255, one a lane; [`Splat2d`] says what the numbers are.
+/// Ellipses alpha >= 1/255, one per lane; [`Splat2d`] describes the values.
 #[derive(Clone, Copy)]
 pub(super) struct Ellipse<S: Simd> {
     pub(super) mean_x: S::F,
@@ -68,7 +69,7 @@ pub(super) struct Ellipse<S: Simd> {
 }
 
 impl<S: Simd> Ellipse<S> {
-    /// The same ellipse in every lane.
+    /// Returns the same ellipse in every lane.
     #[inline(always)]
     fn of(s: S, splat: &Splat2d) -> Self {
         Self {
@@ -83,14 +84,14 @@ impl<S: Simd> Ellipse<S> {
         }
     }
 
-    /// Returns what the ellipse covers of a band of blocks whose first row of pixels is `top`.
+    /// Returns the part of a band of blocks that the ellipse covers. `top` is the first row of pixels of the band.
     #[inline(always)]
     fn span(&self, s: S, top: S::F) -> Span<S> {
         let first = top + s.splat(0.5) - self.mean_y;
         let last = first + s.splat(block_height(S::LANES) as f32 - 1.0);
         let zero = s.splat(0.0);
         let reaches = s.lt(first, self.extent_y) & s.lt(zero - self.extent_y, last);
-        // The outermost points are the ellipse's tips, or where it leaves the band next to them.
+        // The outermost points are the tips of the ellipse, or its intersection with the band's edge nearest to them.
         let leftmost = s.min(s.max(zero - self.tip_y, first), last);
         let rightmost = s.min(s.max(self.tip_y, first), last);
         let left = self.middle(s, leftmost) - self.half(s, leftmost);
@@ -98,13 +99,13 @@ impl<S: Simd> Ellipse<S> {
         Span { reaches, left, right }
     }
 
-    /// Returns the x in the middle of the ellipse at a height. [px]
+    /// Returns the x of the ellipse's middle at height `dy`. [px]
     #[inline(always)]
     fn middle(&self, s: S, dy: S::F) -> S::F {
         s.mul_add(self.shear, dy, self.mean_x)
     }
 
-    /// Returns half the ellipse's width at a height. [px]
+    /// Returns half the width of the ellipse at height `dy`. [px]
     #[inline(always)]
     fn half(&self, s: S, dy: S::F) -> S::F {
         let v = dy * self.scale_y;
@@ -113,13 +114,13 @@ impl<S: Simd> Ellipse<S> {
     }
 }
 
-/// What ellipses cover of a band of blocks, one a lane.
+/// Part of a band of blocks that ellipses cover, one per lane.
 struct Span<S: Simd> {
-    /// Whether they reach it at all.
+    /// Whether the ellipse reaches the band.
     reaches: S::M,
-    /// The leftmost x. [px]
+    /// Leftmost x. [px]
     left: S::F,
-    /// The rightmost.
+    /// Rightmost x. [px]
     right: S::F,
 }
 
@@ -132,8 +133,8 @@ impl<S: Simd> Span<S> {
     }
 }
 
-/// Returns which blocks of a window the ellipses touch, within an image of a size [px]: [`Cover::blocks`] as whole
-/// numbers, its lower and its upper 16 bits. `corner` is the windows' first pixels.
+/// Returns which blocks of a window the ellipses touch, within an image of `size` [px]: [`Cover::blocks`] as whole
+/// numbers, its lower and its upper 16 bits. `corner` is the first pixel of the windows.
 #[inline(always)]
 pub(super) fn window<S: Simd>(
     s: S,
@@ -162,11 +163,11 @@ pub(super) fn window<S: Simd>(
     halves
 }
 
-/// What an ellipse, the same in all lanes, touches of a vector of bands, one below the other: one or more rows of tiles.
+/// Blocks that one ellipse, equal in all lanes, touches in a vector of consecutive bands: one or more rows of tiles.
 pub(super) struct Bands<S: Simd>(Span<S>);
 
 impl<S: Simd> Bands<S> {
-    /// Prepares the bands from `top` on. [px]
+    /// Computes the bands from row `top` on. [px]
     #[inline(always)]
     pub(super) fn new(s: S, splat: &Splat2d, top: f32) -> Self {
         const LANE: [f32; 16] =
@@ -175,7 +176,8 @@ impl<S: Simd> Bands<S> {
         Self(Ellipse::of(s, splat).span(s, s.mul_add(s.load(&LANE), height, s.splat(top))))
     }
 
-    /// Returns the bits of the bands' blocks of a column of tiles, for [`Self::of_row`]. `left` is its first pixel.
+    /// Returns the bits of the bands' blocks in a column of tiles, for [`Self::of_row`]. `left` is the column's first
+    /// pixel.
     #[inline(always)]
     pub(super) fn of_column(&self, s: S, left: f32) -> u64 {
         let mut bits = 0;
@@ -186,14 +188,14 @@ impl<S: Simd> Bands<S> {
         bits
     }
 
-    /// Returns the blocks of one tile among `bits`, in which `row`-th of the vector's rows of tiles it lies.
+    /// Returns the blocks of one tile from `bits`; `row` is its row of tiles within the vector.
     #[inline(always)]
     pub(super) fn of_row(bits: u64, row: usize) -> u32 {
         let bands = bands(S::LANES);
         if bands == S::LANES {
             return bits as u32;
         }
-        // Four groups of four bits, 16 apart, next to each other.
+        // Moves four groups of four bits, 16 apart, next to each other.
         let groups = bits >> (bands * row) & 0x000f_000f_000f_000f;
         let pairs = (groups | groups >> 12) & 0x0000_00ff_0000_00ff;
         (pairs | pairs >> 24) as u32 & 0xffff

@@ -1,4 +1,4 @@
-//! Pass 1: which blocks of splats can touch the image.
+//! Pass 1: selects the blocks of splats that can touch the image.
 //!
 //! Budget: 5 planes per block of 256 splats, 20 us per million splats.
 
@@ -11,38 +11,38 @@ use super::scene::{Block, Part};
 use crate::limits::BLUR_PX2;
 use crate::{Atmosphere, Camera};
 
-/// A camera, as one part of the scene sees it, in the numbers the passes use; f32, but for what is
+/// Camera as seen from one part of the scene, with the values that the passes use. f32, except for values that are
 /// computed once per image.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ObjectView {
     pub(super) width_px: u32,
     pub(super) height_px: u32,
-    /// Rows of the rotation to the camera's axes.
+    /// Rows of the rotation into the camera's axes.
     pub(super) rows: [Vec3; 3],
-    /// The camera's centre. [m, part]
+    /// Centre of the camera. [m, part]
     pub(super) center_m: Vec3,
     pub(super) near_m: f32,
     pub(super) fx_px: f32,
     pub(super) fy_px: f32,
     pub(super) cx_px: f32,
     pub(super) cy_px: f32,
-    /// Where `x/z` is clamped for the linearisation: least, greatest.
+    /// Minimum and maximum to which `x/z` is clamped for the linearisation.
     pub(super) slope_x: [f32; 2],
-    /// Where `y/z` is.
+    /// Minimum and maximum to which `y/z` is clamped.
     pub(super) slope_y: [f32; 2],
-    /// What is seen of it through the air.
+    /// Background after light and fog.
     pub(super) background: [f32; 3],
-    /// `None` where it changes nothing.
+    /// Light and fog; `None` if they change nothing.
     pub(super) atmosphere: Option<Atmosphere>,
     pub(super) model: Model,
-    /// Means whose slope is longer are dropped; infinite without a lens.
+    /// Maximum length of a slope; splats with longer slopes are dropped. Infinite without a lens.
     pub(super) reach: f32,
     planes: [Plane; 5],
     /// [`ShownSlopes::large`](super::lens::ShownSlopes::large).
     large: f32,
 }
 
-/// `normal . (p - camera) + reach * weight >= offset` where a splat at `p` may touch the image.
+/// A splat at `p` may touch the image if `normal . (p - camera) + reach * weight >= offset`.
 #[derive(Clone, Copy, Debug)]
 struct Plane {
     normal: Vec3,
@@ -51,7 +51,7 @@ struct Plane {
 }
 
 impl ObjectView {
-    /// Prepares a validated camera, and its lens, that stands at `part_from_cam`.
+    /// Prepares a validated camera with its lens, for a part relative to which it has the pose `part_from_cam`.
     pub(super) fn new<F: Frame>(
         camera: &Camera,
         lens: &Lens,
@@ -89,7 +89,7 @@ impl ObjectView {
                 plane(-y * k.fy_px + z * (h - k.cy_px + blur), steep_y),
             ]
         } else {
-            // Linear in the position too: x - low z + spread d >= 0; `sees` keeps what is large.
+            // Also linear in the position: x - low z + spread d >= 0. `sees` keeps large splats.
             let [shown_x, shown_y] = bounds([shown.low, shown.high]);
             [
                 ahead,
@@ -114,7 +114,7 @@ impl ObjectView {
             background: camera.atmosphere.background(camera.background),
             atmosphere: Some(camera.atmosphere).filter(|atmosphere| !atmosphere.is_clear()),
             model: lens.model,
-            // f32's rounding, so that what lies on the reach itself is rendered.
+            // Widened by the rounding of f32, so that splats exactly at the reach are rendered.
             reach: (lens.reach * (1.0 + 1e-6)) as f32,
             planes,
             large: shown.large as f32,
@@ -126,9 +126,9 @@ impl ObjectView {
         let center = block.center_m - self.center_m;
         let beyond = |plane: &Plane| {
             let slack = plane.normal.abs().dot(block.half_m) + block.reach_m * plane.weight;
-            // The rounding of the sums, so that nothing is lost at the very edge.
+            // Rounding error of the sums, so that nothing is lost at the edge.
             let rounding = 1e-5 * (center.abs().max_element() + slack);
-            // Not `>=` elsewhere, so that an overflow to NaN keeps the block.
+            // Not written as `>=`, so that an overflow to NaN keeps the block.
             plane.normal.dot(center) + slack + rounding < plane.offset
         };
         if beyond(&self.planes[0]) {
@@ -143,14 +143,14 @@ impl ObjectView {
 /// A block that may touch the image.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Visible {
-    /// Index of the part.
+    /// Part index.
     pub(super) part: u32,
-    /// Index of the block in it.
+    /// Block index within the part.
     pub(super) block: u32,
 }
 
-/// Appends the blocks of a part that may touch the image; of its levels, everywhere the coarsest
-/// that is off by no more than `max_error_px`.
+/// Appends the blocks of a part that may touch the image. Selects everywhere the coarsest level whose error is at
+/// most `max_error_px`.
 pub(super) fn cull(
     index: usize,
     part: &Part,
@@ -166,7 +166,7 @@ pub(super) fn cull(
     }
 }
 
-/// A walk over the tree of a part's levels.
+/// Traversal of the tree of a part's levels.
 struct Walk<'a> {
     index: u32,
     part: &'a Part,
@@ -175,7 +175,7 @@ struct Walk<'a> {
 }
 
 impl Walk<'_> {
-    /// Visits a block, given by its place in its level, and what it stands for.
+    /// Visits a block, given by its index within its level, and its children.
     fn descend(&self, level: usize, block: usize, visible: &mut Vec<Visible>) {
         let at = self.part.levels[level] + block;
         let bounds = &self.part.blocks[at];
@@ -194,7 +194,7 @@ impl Walk<'_> {
 }
 
 impl ObjectView {
-    /// Returns how many pixels a metre is at most where the block is nearest to the camera.
+    /// Returns the maximum number of pixels per metre within the block, at its point nearest to the camera.
     pub(super) fn px_per_m(&self, block: &Block) -> f32 {
         let forward = self.rows[2];
         let center = block.center_m - self.center_m;

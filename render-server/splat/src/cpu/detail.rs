@@ -1,14 +1,14 @@
-//! Coarser levels of a part, made once, so that an image costs what it shows and not what exists.
+//! Coarser levels of a part, computed once, so that the cost of an image depends on what it shows and not on the size
+//! of the scene.
 //!
-//! Level 0 is the part's blocks as they are. A block of level l + 1 stands for four consecutive
-//! blocks of level l: its 256 splats are merged from their 1024. So the levels form a tree over the
-//! Morton order, together a third more memory, and `cull` walks it from the top: a subtree out of
-//! view costs one test, and one whose merged splats are off by less than the allowed pixels is
-//! rendered by them.
+//! Level 0 contains the part's original blocks. A block of level l + 1 represents four consecutive blocks of level l:
+//! its 256 splats are merged from their 1024. The levels form a tree over the Morton order and take a third more
+//! memory. `cull` walks it from the top: a subtree out of view costs one test, and a subtree whose merged splats have
+//! an error below the allowed pixels is rendered by them.
 //!
-//! Splats to merge are found by repeated splitting: the cluster with the greatest weighted spread
-//! is cut in two across its longest axis, until there are a quarter as many clusters as splats.
-//! Lone splats stay alone; dense ones merge by the dozen.
+//! Clusters of splats are found by repeated splitting: the cluster with the greatest weighted spread is cut across
+//! its longest axis, until there are a quarter as many clusters as splats. Isolated splats remain; dense ones merge
+//! by the dozen.
 //!
 //! Cost: 0.3 ms per 1024 splats and thread, once.
 
@@ -22,34 +22,35 @@ use super::scene::{BLOCK, Block, GROUP, GROUP_NUMBERS, Part, column};
 use crate::Scene;
 use crate::limits::BLUR_PX2;
 
-/// How much of a scene's detail is rendered.
+/// Level of detail of a rendered scene.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Detail {
-    /// Every splat in view.
+    /// Renders every splat in view.
     #[default]
     Full,
-    /// Merged splats for what is small in the image: memory and packing time grow by a third, an
-    /// image costs what it shows.
+    /// Renders merged splats where the scene is small in the image. Memory and packing time grow by a third; the cost
+    /// of an image depends on what it shows.
     Adaptive {
-        /// How far splats may be rendered from where they are, as root mean square; nothing is merged
-        /// unless it is above 0. [px]
+        /// Maximum error of the position of splats, as root mean square; splats are merged only if it is above 0.
+        /// [px]
         max_error_px: f32,
     },
 }
 
 impl Detail {
-    /// As coarse as stays like full detail, on generated and captured scenes: where a picture has 15 splats a pixel and
-    /// fewer in sight, RGB to 37 dB and alpha to 37 dB, a channel off by more than 8 of 255 in 4 % of the pixels at
-    /// most, the median depth by more than 1 % in 6 % of those that show something. Up to 100 splats a pixel, RGB to
-    /// 30 dB: so many are in sight from far away alone, and which of them hides which is chance in full detail too.
-    /// Single pixels at edges may be off by any amount. `tests/lod` holds it; 0.5 px does not.
+    /// Coarsest setting that stays similar to full detail, on generated and captured scenes. With up to 15 visible
+    /// splats per pixel: RGB and alpha within 37 dB, a channel off by more than 8 of 255 in at most 4 % of the
+    /// pixels, and the median depth off by more than 1 % in at most 6 % of the covered pixels. With up to 100 splats
+    /// per pixel: RGB within 30 dB. Such density occurs only in distant views, and which splat hides which is random
+    /// in full detail too. Single pixels at edges may have any error. `tests/lod` checks these limits; 0.5 px does
+    /// not meet them.
     pub const ADAPTIVE: Self = Self::Adaptive { max_error_px: Self::ADAPTIVE_PX };
-    /// The error that it allows. [px]
+    /// Maximum error of [`Self::ADAPTIVE`]. [px]
     pub const ADAPTIVE_PX: f32 = 0.35;
-    /// Scenes of fewer splats are rendered fast enough in full. [splats]
+    /// Minimum number of splats for adaptive detail; smaller scenes are rendered fast enough in full detail. [splats]
     pub const WORTHWHILE_FROM: usize = 1_000_000;
 
-    /// Returns what suits a scene: every splat of a small one, adaptive detail for a large one.
+    /// Returns the detail for a scene: full for a small one, adaptive for a large one.
     pub fn suited_to(scene: &Scene<'_>) -> Self {
         let moving: usize = scene.objects.iter().map(|object| object.splats.len()).sum();
         let all = scene.splats.len() + moving;
@@ -57,10 +58,10 @@ impl Detail {
     }
 }
 
-/// Blocks of one level that a block of the next stands for.
+/// Number of blocks of one level that a block of the next level represents.
 pub(crate) const BRANCH: usize = 4;
 
-/// Adds the coarser levels to a part that has only the finest.
+/// Adds the coarser levels to a part that has only the finest level.
 pub(super) fn add_levels(part: &mut Part, max_error_px: f32) {
     if !(max_error_px > 0.0) {
         return;
@@ -84,7 +85,7 @@ pub(super) fn add_levels(part: &mut Part, max_error_px: f32) {
         let (geometry, out_geometry) = part.geometry.split_at_mut(end * geometry_block);
         let (sh, out_sh) = part.sh.split_at_mut(end * sh_block);
         let coefficients = part.coefficients;
-        // What is dimmed by as much as the blur adds covers its own area at any distance.
+        // An anti-aliased splat is dimmed by as much as the blur adds, so it covers its own area at any distance.
         let blur_px2 = if part.antialiased { 0.0 } else { BLUR_PX2 };
         let blocks = &part.blocks[first..];
         let mut out_origins = vec![Origin::default(); coarser * BLOCK];
@@ -115,20 +116,20 @@ pub(super) fn add_levels(part: &mut Part, max_error_px: f32) {
     }
 }
 
-/// Up to [`BRANCH`] blocks of a level.
+/// Up to [`BRANCH`] blocks of a level: the input of a merge.
 struct From<'a> {
     geometry: &'a [f32],
     sh: &'a [u16],
     coefficients: usize,
-    /// `None` where the splats are the scene's own.
+    /// Sums per splat; `None` for original splats.
     origins: Option<&'a [Origin]>,
     blocks: &'a [Block],
     max_error_px: f64,
-    /// What the pixel adds to what a splat covers. [px^2]
+    /// Variance that the pixel adds to a splat. [px^2]
     blur_px2: f64,
 }
 
-/// The block that stands for them.
+/// Merged block: the output of a merge.
 struct Out<'a> {
     geometry: &'a mut [f32],
     sh: &'a mut [u16],
@@ -138,21 +139,21 @@ struct Out<'a> {
 #[derive(Default)]
 struct Scratch {
     blobs: Vec<Blob>,
-    /// Place of each blob in the packed blocks.
+    /// Index of each blob in the packed blocks.
     places: Vec<u32>,
     order: Vec<u32>,
     clusters: Vec<Cluster>,
     sh: Vec<f32>,
 }
 
-/// A run of `order`, and where it would be cut.
+/// Range of `order`, with the axis of its next cut.
 #[derive(Clone, Copy)]
 struct Cluster {
     start: u32,
     end: u32,
     mean_m: DVec3,
     axis: DVec3,
-    /// Weighted sum of squares from the mean; 0 where it cannot be cut.
+    /// Weighted sum of squared distances from the mean; 0 if the cluster cannot be cut.
     score: f64,
 }
 
@@ -172,7 +173,7 @@ fn merge_blocks(from: &From<'_>, out: Out<'_>, scratch: &mut Scratch) -> Block {
     let count = scratch.blobs.len().div_ceil(BRANCH).min(BLOCK);
     let error_m = cluster(count, from.blur_px2 / from.max_error_px.powi(2), scratch);
 
-    // Twice the least distance is where the next level takes over: made for the middle of that.
+    // The next level is used from twice the minimum distance on, so the merge is made for the middle of that range.
     let Scratch { blobs, places, order, clusters, sh } = scratch;
     let pixel_blur = |error_m: f64| from.blur_px2 * (1.4 * error_m / from.max_error_px).powi(2);
     let weight_blur_m2 = pixel_blur(error_m);
@@ -188,7 +189,7 @@ fn merge_blocks(from: &From<'_>, out: Out<'_>, scratch: &mut Scratch) -> Block {
         error_m2 += m * blob.error_m2();
         *origin = blob.origin;
     }
-    // NaN and overflow become infinite: never rendered.
+    // NaN and overflow become infinite: such a block is never rendered.
     let error_m = (error_m2 / mass).sqrt() as f32;
     block.error_m = if error_m.is_finite() { block.error_m.max(error_m) } else { f32::INFINITY };
 
@@ -213,7 +214,7 @@ fn merge_blocks(from: &From<'_>, out: Out<'_>, scratch: &mut Scratch) -> Block {
             }
             put(column::LEVEL, opacity.log2() as f32);
             let deviations = (2.0 * (opacity * 255.0).ln().max(0.0)).sqrt();
-            // The greatest deviation is at most that of the matrix's norm.
+            // The greatest deviation is at most the root of the matrix's norm.
             let norm = covariance_m2.to_cols_array().iter().map(|v| v * v).sum::<f64>().sqrt();
             block.reach_m = block.reach_m.max((deviations * norm.sqrt() * 1.0001) as f32);
 
@@ -234,7 +235,7 @@ fn merge_blocks(from: &From<'_>, out: Out<'_>, scratch: &mut Scratch) -> Block {
     block
 }
 
-/// Fills `blobs` with the splats of the blocks, relative to a middle.
+/// Fills `blobs` with the splats of the blocks, relative to `center_m`.
 fn unpack(from: &From<'_>, center_m: DVec3, scratch: &mut Scratch) {
     let Scratch { blobs, places, .. } = scratch;
     blobs.clear();
@@ -264,8 +265,8 @@ fn unpack(from: &From<'_>, center_m: DVec3, scratch: &mut Scratch) {
     }
 }
 
-/// Cuts the blobs into `count` clusters, or fewer where they coincide; returns the expected error
-/// of a cluster [m]. `blur` is the pixel's, in squares of the error that is allowed.
+/// Cuts the blobs into `count` clusters, or fewer if blobs coincide. Returns the expected error of a cluster [m].
+/// `blur` is the pixel's blur, in squares of the allowed error.
 fn cluster(count: usize, blur: f64, scratch: &mut Scratch) -> f64 {
     let Scratch { blobs, order, clusters, .. } = scratch;
     order.clear();
@@ -274,7 +275,7 @@ fn cluster(count: usize, blur: f64, scratch: &mut Scratch) -> f64 {
     if blobs.is_empty() {
         return 0.0;
     }
-    // A surface cut into n pieces: each has an n-th of its square extent.
+    // A surface cut into n pieces: the square extent of each is an n-th.
     let whole = examine(blobs, order, 0, order.len() as u32, 0.0);
     let mass: f64 = blobs.iter().map(|blob| blob.mass(0.0)).sum();
     let error_m = (whole.score / mass / count as f64).sqrt();
@@ -295,7 +296,7 @@ fn cluster(count: usize, blur: f64, scratch: &mut Scratch) -> f64 {
             break;
         }
         if cut == 0 || cut == members.len() {
-            // Rounding: too close to distinguish.
+            // Too close to distinguish after rounding.
             clusters[worst].score = 0.0;
             continue;
         }
@@ -303,12 +304,12 @@ fn cluster(count: usize, blur: f64, scratch: &mut Scratch) -> f64 {
         clusters[worst] = examine(blobs, order, cluster.start, cut, blur_m2);
         clusters.push(examine(blobs, order, cut, cluster.end, blur_m2));
     }
-    // Neighbours in space stay neighbours in memory.
+    // Keeps neighbours in space close in memory.
     clusters.sort_unstable_by_key(|cluster| cluster.start);
     error_m
 }
 
-/// Moves those that hold to the front, and returns how many do.
+/// Moves the members that satisfy `holds` to the front. Returns their number.
 fn partition(members: &mut [u32], holds: impl Fn(u32) -> bool) -> usize {
     let mut front = 0;
     for i in 0..members.len() {
@@ -320,7 +321,7 @@ fn partition(members: &mut [u32], holds: impl Fn(u32) -> bool) -> usize {
     front
 }
 
-/// Returns the cluster of a run of `order`.
+/// Returns the cluster of a range of `order`.
 fn examine(blobs: &[Blob], order: &[u32], start: u32, end: u32, blur_m2: f64) -> Cluster {
     let members = order[start as usize..end as usize].iter().map(|&i| &blobs[i as usize]);
     let (mut mass, mut sum) = (0.0, DVec3::ZERO);
@@ -337,7 +338,7 @@ fn examine(blobs: &[Blob], order: &[u32], start: u32, end: u32, blur_m2: f64) ->
         moment += DMat3::from_cols(weighted * d.x, weighted * d.y, weighted * d.z);
     }
     let score = trace(&moment);
-    // The longest axis, by repeated multiplication from the largest column.
+    // Longest axis, by repeated multiplication from the largest column.
     let columns = [moment.x_axis, moment.y_axis, moment.z_axis];
     let mut axis = columns
         .into_iter()

@@ -1,8 +1,8 @@
-//! The lens: what of a camera is computed once per intrinsics, and the distortion of vectors of
-//! slopes; the vector form of [`Distortion::distort`].
+//! Lens: values of a camera that are computed once per intrinsics, and the distortion of vectors of slopes (the
+//! vector form of [`Distortion::distort`]).
 //!
-//! Budget: finding the bounds costs some 250 inversions of the lens, about 2 ms, whenever a camera's
-//! intrinsics change, nothing after; the distortion some 2 ns per splat and thread.
+//! Budget: the bounds cost about 250 inversions of the lens, 2 ms, when the intrinsics of a camera change. The
+//! distortion costs about 2 ns per splat and thread.
 
 use glam::DVec2;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics};
@@ -11,10 +11,10 @@ use super::simd::Simd;
 use crate::Camera;
 use crate::limits::BLUR_PX2;
 
-/// A lens's coefficients, as [`Distortion`] has them.
+/// Coefficients of a lens, as in [`Distortion`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Model {
-    /// No lens.
+    /// Pinhole without distortion.
     Pinhole,
     /// k1, k2, p1, p2, k3.
     BrownConrady([f32; 5]),
@@ -22,22 +22,22 @@ pub(super) enum Model {
     KannalaBrandt([f32; 4]),
 }
 
-/// What follows from intrinsics alone.
+/// Values that depend on the intrinsics only.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Lens {
     of: Intrinsics,
     pub(super) model: Model,
     /// [`Camera::slope_bounds`].
     pub(super) slopes: [DVec2; 2],
-    /// Means whose slope is longer are dropped.
+    /// Maximum length of a slope; splats with longer slopes are dropped.
     pub(super) reach: f64,
-    /// Where means are whose splats may touch the image. Of use only with a lens.
+    /// Bounds on the means of splats that may touch the image. Used only with a lens.
     pub(super) shown: ShownSlopes,
 }
 
-/// Bounds on the means of splats that may touch the image behind a lens. With `z` the mean's and
-/// `d` the distance at which its splat still counts:
-/// `low - spread d / z <= slope <= high + spread d / z`, unless `z < large d`.
+/// Bounds on the means of splats that may touch the image behind a lens. With `z` the depth of the mean, and `d` the
+/// distance from it at which its splat is still visible: `low - spread d / z <= slope <= high + spread d / z`, unless
+/// `z < large d`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ShownSlopes {
     pub(super) low: DVec2,
@@ -54,24 +54,24 @@ impl Lens {
         let (model, steep) = match k.distortion {
             Distortion::None => (Model::Pinhole, 1.0),
             Distortion::BrownConrady { k1, k2, p1, p2, k3 } => {
-                // No slope that is linearised is longer than this.
+                // Maximum length of a slope that is linearised.
                 let r = slopes[0].abs().max(slopes[1].abs()).length().min(reach);
                 let rr = r * r;
-                // At least the greatest singular value of the lens's Jacobian.
+                // Upper bound of the greatest singular value of the lens's Jacobian.
                 let radial = 3.0 * k1.abs() + rr * (5.0 * k2.abs() + rr * 7.0 * k3.abs());
                 let steep = 1.0 + rr * radial + 8.0 * r * (p1.abs() + p2.abs());
                 let model = Model::BrownConrady([k1, k2, p1, p2, k3].map(|k| k as f32));
                 (model, steep * (1.0 + rr).sqrt())
             }
             Distortion::KannalaBrandt { k1, k2, k3, k4 } => {
-                // In angles a fisheye is nowhere steep: slopes' growth and the arc's cancel.
+                // In angles, a fisheye is nowhere steep: the growth of slopes and of the arc cancel.
                 let tt = std::f64::consts::FRAC_PI_2.powi(2);
                 let bend = 7.0 * k3.abs() + tt * 9.0 * k4.abs();
                 let steep = 1.0 + tt * (3.0 * k1.abs() + tt * (5.0 * k2.abs() + tt * bend));
                 (Model::KannalaBrandt([k1, k2, k3, k4].map(|k| k as f32)), steep)
             }
         };
-        // All that the lens shows, to begin with.
+        // Start value: everything that the lens can image.
         let whole = ShownSlopes {
             low: DVec2::splat(-reach),
             high: DVec2::splat(reach),
@@ -86,22 +86,21 @@ impl Lens {
     }
 }
 
-/// How far outside the image splats' means are bounded exactly, as shares of its size: the first
-/// that the lens still images.
+/// Margins around the image in which means are bounded exactly, as shares of its size. The first one that the lens
+/// can image is used.
 const MARGINS: [f64; 3] = [0.6, 0.3, 0.1];
 
-/// Returns the shown of a lens that spreads no angle by more than `steep`, if it images all of the
-/// image and a margin of `share` of its size around.
+/// Returns the bounds of a lens that spreads no angle by more than `steep`, if the lens can image the whole image and
+/// a margin of `share` of its size.
 fn shown(k: &Intrinsics, steep: f64, share: f64) -> Option<ShownSlopes> {
     let focal = DVec2::new(k.fx_px, k.fy_px);
     let size = DVec2::new(f64::from(k.width_px), f64::from(k.height_px));
-    // How far the blur alone lets the most opaque splat be seen, and a pixel for the steps between
-    // the points.
+    // Distance at which the most opaque splat is visible by blur only, plus a pixel for the steps between the points.
     let near_px = DVec2::splat((2.0 * 255f64.ln() * BLUR_PX2).sqrt() + 1.0);
     let margin_px = share * size.max_element();
     let far_px = near_px + margin_px;
     let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-    // The least that the lens moves a point when the slope moves by one.
+    // Minimum displacement of the image point when the slope moves by one.
     let mut least = f64::INFINITY;
     for i in 0..=POINTS {
         for j in 0..=POINTS {
@@ -114,24 +113,23 @@ fn shown(k: &Intrinsics, steep: f64, share: f64) -> Option<ShownSlopes> {
             if border || i % 4 == 0 && j % 4 == 0 {
                 let slope = k.slope(at * (size + 2.0 * far_px) - far_px)?;
                 let bend = k.distortion.distort(slope).1;
-                // Singular values: their product over at least the greater.
+                // Smallest singular value: the product of both, divided by an upper bound of the greater one.
                 let greatest = bend.x_axis.length().hypot(bend.y_axis.length());
                 least = least.min(bend.determinant().abs() / greatest);
             }
         }
     }
-    // A splat touches the image where its mean, bent, is within `steep d / z` of it in x and in y,
-    // so its slope is within that, times the diagonal, over `least`. A quarter more, for what lies
-    // between the points.
+    // A splat touches the image if its distorted mean is within `steep d / z` of it in x and in y. Its slope is then
+    // within that, times the diagonal, divided by `least`. One quarter is added for the space between the points.
     let spread = 1.25 * steep * std::f64::consts::SQRT_2 / least;
     let large = focal.max_element() * steep / margin_px;
     (spread.is_finite() && large.is_finite()).then_some(ShownSlopes { low, high, spread, large })
 }
 
-/// Points, less one, along each side of the image at which a lens is examined.
+/// Number of points, minus one, along each side of the image at which a lens is evaluated.
 const POINTS: u32 = 24;
 
-/// Lenses by intrinsics: those rendered with last.
+/// Cache of lenses by intrinsics.
 #[derive(Debug, Default)]
 pub(super) struct Lenses {
     kept: Vec<Lens>,
@@ -156,7 +154,7 @@ impl Lenses {
     }
 }
 
-/// Twice what one vehicle carries.
+/// Capacity of the cache: twice the number of cameras of one vehicle.
 const KEPT: usize = 16;
 
 /// Distorted slopes and the lens's Jacobian there, which is symmetric: xx, xy, yy.
@@ -193,7 +191,7 @@ pub(super) fn distort<S: Simd>(s: S, model: &Model, slope: [S::F; 2]) -> Distort
             }
         }
         Model::KannalaBrandt([k1, k2, k3, k4]) => {
-            // On the axis itself any direction serves: both factors are 1 there.
+            // On the axis any direction is valid: both factors are 1 there.
             let r = s.max(s.sqrt(rr), s.splat(1e-6));
             let inverse_r = one / r;
             let t = atan(s, r, inverse_r);
@@ -221,7 +219,7 @@ fn polynomial<S: Simd, const N: usize>(s: S, x: S::F, factors: [f32; N]) -> S::F
     sum
 }
 
-/// Returns the arc tangent of a positive vector, whose inverse is at hand, within 2e-7. [rad]
+/// Returns the arc tangent of a positive vector, given also its inverse, within 2e-7. [rad]
 #[inline(always)]
 fn atan<S: Simd>(s: S, v: S::F, inverse: S::F) -> S::F {
     let steep = s.lt(s.splat(1.0), v);
@@ -230,8 +228,8 @@ fn atan<S: Simd>(s: S, v: S::F, inverse: S::F) -> S::F {
     s.select(steep, s.splat(std::f32::consts::FRAC_PI_2) - angle, angle)
 }
 
-/// `atan(x) / x` on 0 to 1 in powers of `x^2`, minimax in the angle: 6e-9 rad, 2e-7 in f32 (fitted
-/// by reweighted least squares). That is 0.0003 px of a fisheye 3840 px and 170 degrees across.
+/// `atan(x) / x` on 0 to 1 in powers of `x^2`, minimax in the angle: 6e-9 rad, 2e-7 in f32 (fitted by reweighted
+/// least squares). This is 0.0003 px for a fisheye of 3840 px and 170 degrees.
 const ATAN: [f32; 9] = [
     0.999_999_9,
     -0.333_325_98,

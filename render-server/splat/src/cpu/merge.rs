@@ -1,34 +1,33 @@
-//! How several splats become one that looks like them from afar.
+//! Merging of several splats into one that looks similar from a distance.
 //!
-//! Place and shape are matched by moments: the merged mean is the weighted mean, the merged
-//! covariance the weighted covariances plus the spread of the means, so that the mixture keeps its
-//! first two moments (the merging of mixtures in tracking; for splats, Kerbl et al. 2024, "A
-//! hierarchical 3D Gaussian representation"). A weight is what a splat covers: opacity times area.
+//! Position and shape are matched by moments: the merged mean is the weighted mean, and the merged covariance is the
+//! weighted covariances plus the spread of the means, so that the mixture keeps its first two moments (mixture
+//! merging in tracking; for splats, Kerbl et al. 2024, "A hierarchical 3D Gaussian representation"). The weight of a
+//! splat is its covered area: opacity times area.
 //!
-//! Two things differ from a plain mixture. First, *the pixel blurs*: far away every splat is rendered
-//! at least a pixel wide ([`crate::limits::BLUR_PX2`]), however small, so what it covers depends on
-//! the distance; a merged splat is made for the distance at which its level is used, whose pixel is
-//! `blur_m2`. Second, *splats overlap*: n of them at random places in the merged splat's area hide
-//! `1 - (1 - u)^n` of what lies behind its middle, not `n u`. Integrated over a Gaussian profile
-//! that is [`covered`].
+//! Two things differ from a plain mixture. First, *the pixel blurs*: a distant splat is rendered at least a pixel
+//! wide ([`crate::limits::BLUR_PX2`]), so its covered area depends on the distance. A merged splat is made for the
+//! distance at which its level is used, whose pixel is `blur_m2`. Second, *splats overlap*: n splats at random places
+//! in the merged splat's area hide `1 - (1 - u)^n` of the background at its middle, not `n u`. [`covered`] integrates
+//! this over a Gaussian profile.
 
 use glam::{DMat3, DVec3};
 
-/// A splat as merging sees it, and what of the scene's own splats is in it.
+/// Splat during merging, with sums over the original splats that it contains.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Blob {
-    /// Relative to a middle of the caller's choice. [m]
+    /// Mean relative to a centre that the caller selects. [m]
     pub(super) mean_m: DVec3,
-    /// [m^2]
+    /// Covariance. [m^2]
     pub(super) covariance_m2: DMat3,
-    /// The scene's splats in it.
+    /// Sums over the original splats in the blob.
     pub(super) origin: Origin,
 }
 
-/// Sums over the scene's splats in a blob.
+/// Sums over the original splats in a blob.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Origin {
-    /// How many.
+    /// Number of splats.
     pub(super) count: f32,
     /// Sum of their opacities.
     pub(super) opacity: f32,
@@ -39,7 +38,7 @@ pub(super) struct Origin {
 }
 
 impl Blob {
-    /// Returns one of the scene's own splats.
+    /// Returns the blob of one original splat.
     pub(super) fn new(mean_m: DVec3, axes_m: DMat3, opacity: f64) -> Self {
         let covariance_m2 = axes_m * axes_m.transpose();
         let origin = Origin {
@@ -51,15 +50,14 @@ impl Blob {
         Self { mean_m, covariance_m2, origin }
     }
 
-    /// Returns what the blob's splats cover where the pixel blurs by `blur_m2`: its weight. [m^2]
+    /// Returns the weight of the blob: the area that its splats cover if the pixel blurs by `blur_m2`. [m^2]
     pub(super) fn mass(&self, blur_m2: f64) -> f64 {
         f64::from(self.origin.covered_m2)
             + f64::from(self.origin.opacity) * blur_m2.max(MIN_BLUR_M2)
     }
 
-    /// Returns the square of how far from the truth the blob is, as a length: how far its splats
-    /// lie from it, and a part of their own size, for their shapes differ too. 0 for a splat of the
-    /// scene. [m^2]
+    /// Returns the squared error of the blob: the distance of its splats from it, and a share of their own size,
+    /// because their shapes differ too. 0 for an original splat. [m^2]
     pub(super) fn error_m2(&self) -> f64 {
         if self.origin.count < 1.5 {
             return 0.0;
@@ -69,8 +67,8 @@ impl Blob {
         spread_m2 + SHAPE_SHARE * size_m2
     }
 
-    /// Returns covariance and opacity with which it is rendered, so that it covers where the pixel
-    /// blurs by `blur_m2` what its splats did. What would be more than opaque becomes larger.
+    /// Returns the covariance and opacity for rendering, such that the blob covers the same area as its splats if the
+    /// pixel blurs by `blur_m2`. Excess over full opacity increases the size instead.
     pub(super) fn rendered(&self, blur_m2: f64) -> (DMat3, f64) {
         let blur_m2 = blur_m2.max(MIN_BLUR_M2);
         let depth = self.mass(blur_m2) / (area(&self.covariance_m2) + blur_m2);
@@ -80,14 +78,14 @@ impl Blob {
         }
         let growth = (GROWTH_SHARE * (opacity - 1.0)).min(MAX_GROWTH);
         let grown_m2 = self.covariance_m2 * (1.0 + growth);
-        // As thick as its growth of the pixel, but where a needle would cover more than its splats.
+        // Adds the pixel's share of the growth, but limits it so that a needle does not cover more than its splats.
         let most_m2 = thickness(&grown_m2, self.mass(blur_m2) - blur_m2);
         let pixel = DMat3::from_diagonal(DVec3::splat((growth * blur_m2).min(most_m2)));
         (grown_m2 + pixel, 1.0)
     }
 }
 
-/// Merges blobs: their mixture's mean and covariance, weighted by what they cover.
+/// Merges blobs: mean and covariance of their mixture, weighted by covered area.
 pub(super) fn merge(blobs: impl Iterator<Item = Blob> + Clone, blur_m2: f64) -> Blob {
     let mut origin = Origin::default();
     let (mut mass, mut sum) = (0.0, DVec3::ZERO);
@@ -113,14 +111,14 @@ pub(super) fn merge(blobs: impl Iterator<Item = Blob> + Clone, blur_m2: f64) -> 
     Blob { mean_m, covariance_m2, origin }
 }
 
-/// Returns the area of a Gaussian's image seen from a random side (root mean square), over 2 pi:
-/// the variance itself for a ball, none for a needle. [m^2]
+/// Returns the area of a Gaussian's image from a random direction (root mean square), divided by 2 pi: the variance
+/// for a ball, 0 for a needle. [m^2]
 pub(super) fn area(covariance_m2: &DMat3) -> f64 {
     (minors(covariance_m2) / 3.0).sqrt()
 }
 
-/// Returns the variance that added on every side gives the area `area_m2`; 0 where it is larger
-/// already. [m^2]
+/// Returns the variance that, added in all directions, gives the area `area_m2`; 0 if the area is already larger.
+/// [m^2]
 ///
 /// The minors of `C + v I` sum to `minors(C) + 2 trace(C) v + 3 v^2`.
 fn thickness(covariance_m2: &DMat3, area_m2: f64) -> f64 {
@@ -128,19 +126,19 @@ fn thickness(covariance_m2: &DMat3, area_m2: f64) -> f64 {
     if lacking > 0.0 { lacking / (side + (side * side + 3.0 * lacking).sqrt()) } else { 0.0 }
 }
 
-/// Returns the sum of the principal minors, which is that of the products of two eigenvalues. [m^4]
+/// Returns the sum of the principal minors, which equals the sum of the products of two eigenvalues. [m^4]
 fn minors(covariance_m2: &DMat3) -> f64 {
     let [a, b, c] = [covariance_m2.x_axis, covariance_m2.y_axis, covariance_m2.z_axis];
     let sum = (a.x * b.y - a.y * b.x) + (a.x * c.z - a.z * c.x) + (b.y * c.z - b.z * c.y);
     sum.max(0.0)
 }
 
-/// Returns the opacity that a Gaussian needs to cover what `count` equal ones at random places
-/// cover together, `depth` being the sum of opacity times area over its own area. Above 1 where
-/// they hide all and more.
+/// Returns the opacity with which a Gaussian covers as much as `count` equal ones at random places together. `depth`
+/// is the sum of opacity times area, divided by the Gaussian's area. The result is above 1 if they hide more than an
+/// opaque Gaussian does.
 ///
-/// With u = depth / count, the integral of `1 - (1 - u g)^count` over a Gaussian g, over g's own:
-/// `sum_j (1 - (1 - u)^j) / j`, j from 1 to count. One splat: its own opacity.
+/// With u = depth / count: the integral of `1 - (1 - u g)^count` over a Gaussian g, divided by that of g, is
+/// `sum_j (1 - (1 - u)^j) / j`, j from 1 to count. For one splat it is its own opacity.
 pub(super) fn covered(depth: f64, count: f64) -> f64 {
     let terms = count.clamp(1.0, MAX_TERMS);
     let u = (depth / terms).min(1.0);
@@ -156,11 +154,11 @@ pub(super) fn trace(m: &DMat3) -> f64 {
     m.x_axis.x + m.y_axis.y + m.z_axis.z
 }
 
-/// Returns a lower triangular square root: times its transpose it is the covariance. What rounding
-/// made negative is flat.
+/// Returns a lower triangular square root of the covariance: times its transpose it gives the covariance. Pivots that
+/// rounding made negative become 0.
 pub(super) fn square_root(covariance: &DMat3) -> DMat3 {
     let [a, b, c] = [covariance.x_axis, covariance.y_axis, covariance.z_axis];
-    // Below this share of the whole a pivot is rounding.
+    // Pivots below this share of the trace are rounding errors.
     let least = trace(covariance) * 1e-14;
     let root = |pivot: f64| if pivot > least { pivot.sqrt() } else { 0.0 };
     let ratio = |v: f64, pivot: f64| if pivot > 0.0 { v / pivot } else { 0.0 };
@@ -172,20 +170,20 @@ pub(super) fn square_root(covariance: &DMat3) -> DMat3 {
     DMat3::from_cols(DVec3::new(xx, yx, zx), DVec3::new(0.0, yy, zy), DVec3::new(0.0, 0.0, zz))
 }
 
-/// Of the splats' own size, the share (of squares) that counts as error. Without it large splats
-/// that overlap merge too early: 32 instead of 52 dB at 0.7 px on a captured room.
+/// Share of the splats' own size (in squares) that counts as error. Without it, large overlapping splats merge too
+/// early: 32 instead of 52 dB at 0.7 px on a captured room.
 const SHAPE_SHARE: f64 = 0.25;
-/// Of what would be more than opaque, the share that makes the splat larger. All of it reaches over
-/// the edges of what the cluster shows, where splats ended sharper than a Gaussian does; none leaves
-/// gaps. Measured on 1.5 M splats of a city at 0.5 px: alpha within 52 / 46 / 41 dB for shares of 0.3
-/// / 0.5 / 0.7, but the mean alpha off by least for 0.5, as at other distances and sizes.
+/// Share of the excess over full opacity that makes the splat larger. With 1, splats extend over edges where the
+/// originals ended sharper than a Gaussian; with 0, gaps remain. Measured on 1.5 M splats of a city at 0.5 px: alpha
+/// within 52 / 46 / 41 dB for shares of 0.3 / 0.5 / 0.7, but the error of the mean alpha is smallest for 0.5, as at
+/// other distances and sizes.
 const GROWTH_SHARE: f64 = 0.5;
-/// Hundreds of splats on each other are a plateau: a Gaussian of the same area is wider where it is
-/// seen. A ball of 20,000 splats on 78 pixels covers 70 / 77 / 87 / 120 at most 0.3 / 0.5 / 0.7 / 9.
+/// Maximum growth. Hundreds of overlapping splats form a plateau, and a Gaussian of the same area is visibly wider. A
+/// ball of 20,000 splats on 78 pixels covers 70 / 77 / 87 / 120 for maxima of 0.3 / 0.5 / 0.7 / 9.
 const MAX_GROWTH: f64 = 0.5;
-/// Keeps weights apart from 0 where splats are points; far below anything that is rendered. [m^2]
+/// Keeps weights above 0 if splats are points; far below any rendered size. [m^2]
 const MIN_BLUR_M2: f64 = 1e-24;
-/// More splats than this differ from infinitely many by less than 1 %.
+/// Maximum number of terms. More splats differ from infinitely many by less than 1 %.
 const MAX_TERMS: f64 = 32.0;
 
 #[cfg(test)]

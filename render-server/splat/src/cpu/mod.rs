@@ -1,12 +1,11 @@
-//! The renderer for processors: SIMD, all cores, no allocation per image after the first.
+//! CPU renderer: SIMD, all cores, no allocation per image after the first one.
 //!
-//! Data flow, the files in run order: `scene` packs the splats once, and `detail` adds coarser levels
-//! of them where asked for, made by `merge`. Then, per camera: `cull` lists
-//! the blocks of splats in view, `project` brings their splats onto the image plane, `sort` orders
-//! them by depth, `bin` gives each 16x16-pixel tile its list, `blend` renders the tiles; `cover` says which blocks of
-//! pixels a splat touches. `simd` holds
-//! the instruction sets and all unsafe code; every pass is written once, generic over them. `streamed` takes the place of
-//! `scene` and `cull` for scenes larger than memory.
+//! Data flow, with the files in run order: `scene` packs the splats once. In adaptive detail, `detail` adds coarser
+//! levels, which `merge` computes. Then, per camera: `cull` lists the blocks of splats in view, `project` projects
+//! their splats onto the image plane, `sort` orders them by depth, `bin` assigns them to tiles of 16x16 pixels, and
+//! `blend` renders the tiles. `cover` computes which blocks of pixels a splat touches. `simd` contains the
+//! instruction sets and all unsafe code; every pass is written once, generic over them. `streamed` replaces `scene`
+//! and `cull` for scenes larger than memory.
 //!
 //! Budget on two cores at 3.7 GHz, 125 k splats: 5 ms at 320x240, 11 ms at 640x480.
 
@@ -37,24 +36,24 @@ pub(crate) use streamed::MAGIC as PACKED_MAGIC;
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
 use crate::{Camera, Placement, RgbdImage, RigidObject, Scene};
 
-/// Renders a scene with all cores of the processor.
+/// Renderer that uses all cores of the processor.
 #[derive(Debug)]
 pub struct CpuRenderer {
     instructions: InstructionSet,
     detail: Detail,
     depth_alone: bool,
-    /// What stands still, then the objects.
+    /// Static part, then the objects. In a streamed scene, the static part is a pool of some of its blocks.
     parts: Vec<scene::Part>,
-    /// What stands still is then a pool of some of its blocks.
+    /// Loader of a packed scene; `None` if the scene is in memory.
     streamed: Option<streamed::Streamed>,
     buffers: Buffers,
 }
 
-/// What passes leave for each other; kept from image to image.
+/// Buffers between the passes; reused for the next image.
 #[derive(Debug, Default)]
 struct Buffers {
     lenses: lens::Lenses,
-    /// Per part; those that are not there see nothing, for none of their blocks is visible.
+    /// Views per part. The view of an absent object is unused, because none of its blocks is visible.
     views: Vec<cull::ObjectView>,
     visible: Vec<cull::Visible>,
     projected: project::Projected,
@@ -64,22 +63,22 @@ struct Buffers {
 }
 
 impl CpuRenderer {
-    /// Packs a scene for the fastest instruction set this processor has. Splats that no image
-    /// would show (opacity below 1/255) or that hold numbers that are not finite are left out.
+    /// Packs a scene for the fastest instruction set of this processor. Omits splats that no image would show
+    /// (opacity below 1/255) and splats with numbers that are not finite.
     pub fn new<'a>(scene: impl Into<Scene<'a>>) -> Self {
         Self::with_detail(scene, Detail::Full)
     }
 
-    /// Packs a scene like [`Self::new`], with coarser levels for what will be small in an image.
+    /// Same as [`Self::new`], with coarser levels for distant splats if `detail` is adaptive.
     pub fn with_detail<'a>(scene: impl Into<Scene<'a>>, detail: Detail) -> Self {
         Self::with_instructions(scene.into(), detail, InstructionSet::available()[0])
     }
 
-    /// Renders a packed scene, in the adaptive detail that it was packed for, of which at most so many bytes are in memory
-    /// at once, besides what an image takes and the objects, which are in memory whole.
+    /// Creates a renderer of a packed scene, in the adaptive detail of the packing. At most `memory_bytes` of its
+    /// blocks are in memory at once. Buffers of an image and the objects need additional memory.
     ///
     /// # Errors
-    /// It cannot be read, or needs more memory.
+    /// If the scene cannot be read or needs more memory.
     pub fn streamed(
         scene: PackedScene,
         objects: &[RigidObject],
@@ -101,26 +100,26 @@ impl CpuRenderer {
         })
     }
 
-    /// Returns what the last image of a packed scene was made of.
+    /// Returns the statistics of the last image of a packed scene.
     pub fn streaming(&self) -> Option<Streaming> {
         self.streamed.as_ref().map(streamed::Streamed::streaming)
     }
 
-    /// Packs a scene once per instruction set this processor has, fastest first: for tests and
-    /// benchmarks.
+    /// Packs a scene once per instruction set of this processor, fastest first: for tests and benchmarks.
     pub fn every<'a>(scene: impl Into<Scene<'a>>) -> Vec<Self> {
         let scene = scene.into();
         let sets = InstructionSet::available().into_iter();
         sets.map(|set| Self::with_instructions(scene, Detail::Full, set)).collect()
     }
 
-    /// From now on images have their median depths and ids, bit by bit as ever; colour, alpha and expected depth are
-    /// unspecified. Faster: a pixel ends where half of its light does.
+    /// Restricts the next images to median depths and ids, which stay bit-identical; colour, alpha and expected depth
+    /// are then unspecified. Faster, because a pixel ends at half of its light.
     pub fn set_depth_alone(&mut self, is_alone: bool) {
         self.depth_alone = is_alone;
     }
 
-    /// Counts what the last image of [`Rasterizer::render`], of a size [px], needed; takes many times as long as it.
+    /// Counts the work of the last image of [`Rasterizer::render`], of size `size_px` [px]. Takes many times as long
+    /// as rendering.
     pub fn need(&self, size_px: [usize; 2]) -> Need {
         let Buffers { visible, projected, sorter, bins, .. } = &self.buffers;
         Need {
@@ -131,12 +130,12 @@ impl CpuRenderer {
         }
     }
 
-    /// Measures what this machine does at most: with this renderer's instruction set, and memory of some bytes.
+    /// Measures the maximum throughput of this machine: with this renderer's instruction set, and `bytes` of memory.
     pub fn machine(&self, bytes: usize) -> Machine {
         Machine::measure(self.instructions, bytes)
     }
 
-    /// Returns the parts as they are packed, and how far splats may be off [px]; `None` of a scene larger than memory.
+    /// Returns the packed parts and the allowed error of splats [px]; `None` for a scene larger than memory.
     #[cfg(feature = "gpu")]
     pub(crate) fn packed(&self) -> Option<(&[scene::Part], f32)> {
         self.streamed.is_none().then_some((&self.parts, self.max_error_px()))
@@ -215,7 +214,7 @@ impl CpuRenderer {
 }
 
 impl Rasterizer for CpuRenderer {
-    /// Returns `cpu avx512`, `cpu avx2`, `cpu neon` or `cpu portable`, and whether it is in adaptive detail, of a packed scene.
+    /// Returns `cpu avx512`, `cpu avx2`, `cpu neon` or `cpu portable`, and adds adaptive detail and streaming.
     fn name(&self) -> Cow<'_, str> {
         let name = self.instructions.name();
         match self.detail {
@@ -268,7 +267,7 @@ impl Rasterizer for CpuRenderer {
     }
 }
 
-/// Packs what moves.
+/// Packs the objects.
 fn moving(objects: &[RigidObject], detail: Detail) -> impl Iterator<Item = scene::Part> {
     objects.iter().map(move |object| scene::Part::new(object.id, &object.splats, detail))
 }

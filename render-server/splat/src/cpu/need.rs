@@ -1,5 +1,5 @@
-//! What an image needs of the machine, counted, and how long that takes at least: beside what was measured, how near to
-//! the limit the renderer is.
+//! Counts the work that an image needs, and computes the minimum time for it on a machine. Compared with measured
+//! times, this shows how close the renderer is to the hardware limit.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -13,58 +13,58 @@ use super::simd::{InstructionSet, Kernel, Simd};
 use crate::PassTimes;
 use crate::limits::{ALPHA_MAX, TRANSMITTANCE_MIN};
 
-/// Work that no renderer of the same image by the same method is spared.
+/// Minimum work of any renderer that uses this method.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Need {
-    /// Splats of the blocks in view: read and projected, many of them to nothing.
+    /// Splats of the blocks in view: all are read and projected, many are then dropped.
     pub projected: u64,
-    /// Splats that touch the image: written, sorted and binned.
+    /// Visible splats: written, sorted and binned.
     pub visible: u64,
     /// Bytes of a splat's harmonics.
     pub harmonics_bytes: u64,
     /// (Tile, splat) pairs.
     pub pairs: u64,
-    /// Of these, those before their tile's last pixel ends.
+    /// Pairs before the end of their tile's last pixel.
     pub pairs_used: u64,
     /// (Pixel, splat) pairs that change a pixel before it ends.
     pub evaluations: u64,
-    /// Vectors of pixels, one a block, of which the renderer does at least one pixel's evaluation: those of its lanes that
-    /// are no evaluations are idle.
+    /// Vectors of pixels, one per block, in which at least one pixel is evaluated. The other lanes of such a vector
+    /// are idle.
     pub vectors: u64,
-    /// Pixels.
+    /// Pixels of the image.
     pub pixels: u64,
 }
 
-/// What all threads of this machine do together, at most: measured.
+/// Measured maximum throughput of all threads of this machine together.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Machine {
-    /// Numbers in a vector.
+    /// Values in a vector.
     pub lanes: usize,
-    /// Vector operations, as multiplying and adding. [1/s]
+    /// Vector operations such as multiply-add. [1/s]
     pub operations_per_s: f64,
-    /// Bytes read and written, of as much memory as an image takes. [1/s]
+    /// Bytes read and written, in a working set of the size that an image needs. [1/s]
     pub bytes_per_s: f64,
 }
 
-/// Vector operations of `blend_hits` for one vector of pixels, those that the floating-point ports do.
+/// Operations of `blend_hits` on the floating-point ports, for one vector of pixels.
 const OPERATIONS: u64 = 26;
 /// Bytes of a packed splat's geometry.
 const GEOMETRY: u64 = 52;
-/// Bytes of what projection leaves of a splat: itself, its cover, its key.
+/// Bytes that projection writes per splat: splat, cover and key.
 const PROJECTED: u64 = 64 + 8 + 4;
-/// Bytes that two passes of the sort read and write of a splat.
+/// Bytes that two passes of the sort read and write per splat.
 const SORTED: u64 = 2 * 4 + 8 + 2 * 8 + 4;
-/// Bytes that binning reads of a splat: its slot and its cover.
+/// Bytes that binning reads per splat: slot and cover.
 const BINNED: u64 = 4 + 8;
-/// Bytes of a pair: written to a piece, read, and written to its tile's list.
+/// Bytes per pair: written to a piece, read, and written to the tile's list.
 const PAIR: u64 = 8 + 8 + 8;
-/// Bytes that blending reads of a pair.
+/// Bytes that blending reads per pair.
 const BLENDED: u64 = 8 + 64;
-/// Bytes of a pixel: in a tile, written and read, and in the image.
+/// Bytes per pixel: written to and read from a tile, and written to the image.
 const PIXEL: u64 = 2 * 28 + 26;
 
 impl Need {
-    /// Returns how many bytes all passes read and write.
+    /// Returns the bytes that all passes read and write.
     pub fn bytes(&self) -> u64 {
         self.project_bytes() + self.sort_bytes() + self.bin_bytes() + self.blend_bytes()
     }
@@ -85,7 +85,8 @@ impl Need {
         self.pairs_used * BLENDED + self.pixels * PIXEL
     }
 
-    /// Returns how long each pass takes at least: the longer of its operations, with no lane idle, and its bytes.
+    /// Returns the minimum time of each pass: the longer of its operations (without idle lanes) and its memory
+    /// traffic.
     pub fn bound(&self, machine: &Machine) -> PassTimes {
         let bytes = |bytes: u64| (bytes as f64 / machine.bytes_per_s * 1e3) as f32;
         let vectors = self.evaluations as f64 / machine.lanes as f64;
@@ -103,7 +104,7 @@ impl Need {
 }
 
 impl Machine {
-    /// Measures the machine with an instruction set, and memory of some bytes; the best of some tries.
+    /// Measures the machine with an instruction set and `bytes` of memory; the best of several tries.
     pub(super) fn measure(set: InstructionSet, bytes: usize) -> Self {
         let threads = rayon::current_num_threads();
         let compute_s = fastest(&|| {
@@ -132,14 +133,14 @@ impl Machine {
     }
 }
 
-/// Returns how long all threads need at once, the best of some tries. [s]
+/// Returns the time that all threads need in parallel, the best of several tries. [s]
 fn fastest(work: &(dyn Fn() -> Duration + Sync)) -> f64 {
     const TRIES: usize = 8;
     let once = || rayon::broadcast(|_| work()).into_iter().max().unwrap_or_default();
     (0..TRIES).map(|_| once().as_secs_f64()).fold(f64::INFINITY, f64::min)
 }
 
-/// Independent chains of multiplying and adding: as many as hide an operation's latency.
+/// Independent chains of multiply-add, enough to hide the latency of an operation.
 struct Multiply;
 
 impl Multiply {
@@ -163,7 +164,7 @@ impl Kernel for Multiply {
     }
 }
 
-/// Counts what blending needs of lists of `splats`, on an image of a size [px], with vectors of so many lanes.
+/// Counts the work of blending lists of `splats`, on an image of a given size [px], with vectors of `lanes` lanes.
 pub(super) fn count(
     splats: &[Splat2d],
     bins: &Bins,
@@ -226,7 +227,7 @@ mod tests {
 
     use crate::{Camera, CpuRenderer, Need, Rasterizer, RgbdImage, Splats};
 
-    /// Round splats ahead of the camera, by distance [m] and opacity.
+    /// Renders round splats ahead of the camera, given by distance [m] and opacity.
     fn need_of(splats: &[(f32, f32)]) -> (Need, RgbdImage) {
         let mut scene = Splats::default();
         for &(distance_m, opacity) in splats {
@@ -246,28 +247,28 @@ mod tests {
     }
 
     #[test]
-    fn one_splat_is_evaluated_once_for_each_pixel_that_shows_it() {
+    fn evaluates_one_splat_once_per_pixel() {
         let (need, image) = need_of(&[(2.0, 0.8)]);
         let shown = image.alpha.iter().filter(|&&alpha| alpha > 0.0).count() as u64;
         assert!(shown > 500 && need.evaluations == shown, "{need:?}, shown {shown}");
-        // The vectors of a round splat are mostly its own.
+        // Most lanes of the vectors of a round splat are its own pixels.
         let lanes = CpuRenderer::new(&Splats::default()).machine(1 << 16).lanes as u64;
         assert!(need.vectors * lanes >= shown && need.vectors * lanes < 2 * shown, "{need:?}");
         assert_eq!((need.visible, need.pixels, need.pairs), (1, 80 * 60, need.pairs_used));
     }
 
     #[test]
-    fn what_lies_behind_the_end_of_a_pixel_needs_nothing() {
+    fn splats_behind_the_end_of_a_pixel_need_no_evaluation() {
         // Three of these leave a millionth of the light in the middle.
         let front = [(1.0, 1.0); 3];
         let (alone, _) = need_of(&front);
         let (all, _) = need_of(&[front[0], front[1], front[2], (3.0, 1.0)]);
         let behind = all.evaluations - alone.evaluations;
-        assert!(behind > 0 && behind < alone.evaluations / 3, "{all:?} beside {alone:?}");
+        assert!(behind > 0 && behind < alone.evaluations / 3, "{all:?} compared with {alone:?}");
     }
 
     #[test]
-    fn a_machine_twice_as_fast_needs_half_the_time() {
+    fn bound_halves_on_a_machine_of_twice_the_speed() {
         let (need, _) = need_of(&[(2.0, 0.8)]);
         let machine = super::Machine { lanes: 8, operations_per_s: 1e9, bytes_per_s: 1e9 };
         let bound = need.bound(&machine);

@@ -1,13 +1,13 @@
-//! Pass 2: the splats of visible blocks onto the image plane.
+//! Pass 2: projects the splats of visible blocks onto the image plane.
 //!
-//! Budget: 52 bytes read per splat of a visible block, its harmonics where a lane of its vector
-//! survives; 76 bytes written per survivor. Some 4 ns per splat and thread without harmonics.
+//! Budget: 52 bytes read per splat of a visible block, plus its harmonics if a lane of its vector survives; 76 bytes
+//! written per survivor. About 4 ns per splat and thread without harmonics.
 //!
 //! A projected Gaussian is kept in the form that is cheap and stable to evaluate. With covariance
 //! `[a b; b c]` and `det = a c - b^2`,
 //!   `sigma = c/det (dx - b/c dy)^2 / 2 + dy^2 / c / 2`:
-//! two squares, so never negative, where the usual conic cancels. `det` itself comes from the
-//! minors of the 2x3 square root (Cauchy-Binet), so it cannot cancel either.
+//! two squares, so it is never negative, while the usual conic cancels. `det` is computed from the minors of the 2x3
+//! square root (Cauchy-Binet), so it cannot cancel either.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -21,18 +21,17 @@ use crate::Atmosphere;
 use crate::harmonics::{C0, C1, C2, C3};
 use crate::limits::BLUR_PX2;
 
-/// log2(1/255): below this level a splat is not seen.
+/// log2(1/255): minimum level of a visible splat.
 pub(super) const MIN_LEVEL: f32 = -7.994_353_5;
-/// Half of log2(e): sigma's 1/2, for powers of two.
+/// Half of log2(e): the factor 1/2 of sigma, for powers of two.
 const HALF_LOG2_E: f32 = std::f32::consts::LOG2_E / 2.0;
 /// Extent^2 of the ellipse per level and variance: 2 ln 2.
 const EXTENT2: f32 = 2.0 * std::f32::consts::LN_2;
-/// No splat is wider; guards f32 against overflow. [px]
+/// Maximum extent of a splat; prevents overflow of f32. [px]
 const MAX_EXTENT_PX: f32 = 1e18;
 
-/// A Gaussian on the image plane: alpha at (x, y) is
-/// `2^(level - (scale_x (dx - shear dy))^2 - (scale_y dy)^2)`, dx and dy from the mean. [px] A cache line, so that reading
-/// one is one access to memory.
+/// Gaussian on the image plane. Alpha at (x, y) is `2^(level - (scale_x (dx - shear dy))^2 - (scale_y dy)^2)`, with
+/// dx and dy relative to the mean. [px] Exactly one cache line, so that reading it is one memory access.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(64))]
 pub(super) struct Splat2d {
@@ -41,13 +40,13 @@ pub(super) struct Splat2d {
     pub(super) shear: f32,
     pub(super) scale_x: f32,
     pub(super) scale_y: f32,
-    /// log2 of the opacity.
+    /// Binary logarithm of the opacity.
     pub(super) level: f32,
     /// dy of the rightmost point of the ellipse alpha = 1/255.
     pub(super) tip_y: f32,
-    /// Half the height of that ellipse.
+    /// Half height of that ellipse.
     pub(super) extent_y: f32,
-    /// `1 / scale_x`, or 1e15 if that is less: 0 times it is 0.
+    /// `1 / scale_x`, limited to 1e15, so that 0 times it is 0.
     pub(super) width: f32,
     /// Camera z. [m]
     pub(super) z_m: f32,
@@ -55,7 +54,7 @@ pub(super) struct Splat2d {
     pub(super) tiles: TileBox,
 }
 
-/// The tiles that the box around the ellipse alpha = 1/255 touches, both ends included.
+/// Tiles that the box around the ellipse alpha = 1/255 touches, both ends included.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C)]
 pub(super) struct TileBox {
@@ -65,21 +64,20 @@ pub(super) struct TileBox {
     pub(super) bottom: u16,
 }
 
-/// What the pass leaves behind: per visible block a region of [`BLOCK`] slots, filled from its
-/// start.
+/// Output of the pass: per visible block a region of [`BLOCK`] slots, filled from its start.
 #[derive(Debug, Default)]
 pub(super) struct Projected {
     /// Indexed by slot.
     pub(super) splats: Vec<Splat2d>,
-    /// Apart from the splats, because binning most of them needs no more. Indexed by slot.
+    /// Blocks of pixels by slot. Separate from the splats, because binning needs only the cover of most splats.
     pub(super) covers: Vec<Cover>,
-    /// Camera z as bits, which order as the positive numbers do. Indexed by slot.
+    /// Camera z by slot, as bits; for positive numbers their order is the same.
     pub(super) keys: Vec<u32>,
     /// Filled slots of each region.
     pub(super) counts: Vec<u32>,
 }
 
-/// Projects all splats of the visible blocks; `views` are the camera as each of `parts` sees it.
+/// Projects all splats of the visible blocks; `views` contains the camera relative to each of `parts`.
 pub(super) fn project<S: Simd>(
     simd: S,
     parts: &[Part],
@@ -94,7 +92,7 @@ pub(super) fn project<S: Simd>(
         out.keys.resize(slots, 0);
     }
     out.counts.resize(visible.len(), 0);
-    // One camera has one lens, whichever part it sees.
+    // A camera has the same lens for all parts.
     let distorted = views.first().is_some_and(|view| view.model != Model::Pinhole);
     out.splats
         .par_chunks_mut(BLOCK)
@@ -102,7 +100,7 @@ pub(super) fn project<S: Simd>(
         .zip(out.keys.par_chunks_mut(BLOCK))
         .zip(&mut out.counts)
         .zip(visible)
-        // Four blocks are some 5 us of work.
+        // Four blocks are about 5 us of work.
         .with_min_len(4)
         .for_each(|((((splats, covers), keys), count), &Visible { part, block })| {
             let out = Region { splats, covers, keys };
@@ -117,7 +115,7 @@ pub(super) fn project<S: Simd>(
         });
 }
 
-/// One block, seen through a lens or a pinhole, anti-aliased or classic; returns how many splats survived.
+/// Projects one block, through a lens or a pinhole, anti-aliased or classic. Returns the number of surviving splats.
 struct ProjectBlock<'a, const LENS: bool, const ANTIALIASED: bool> {
     part: &'a Part,
     view: &'a ObjectView,
@@ -155,8 +153,7 @@ impl<const LENS: bool, const ANTIALIASED: bool> Kernel for ProjectBlock<'_, LENS
     }
 }
 
-/// Projects the lanes from `first` of a group, appends survivors from slot `count` on, and returns
-/// the new count.
+/// Projects the lanes from `first` of a group, and appends survivors from slot `count` on. Returns the new count.
 #[inline(always)]
 fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
     columns: Columns<'_, S>,
@@ -167,12 +164,12 @@ fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
 ) -> usize {
     let Columns { s, first, .. } = columns;
     let mean = columns.vector(column::MEAN);
-    // Relative to the camera before anything else: large coordinates cancel while still exact.
+    // Subtracts the camera's position first: large coordinates cancel while they are exact.
     let centre = view.center_m;
     let d = [mean[0] - s.splat(centre.x), mean[1] - s.splat(centre.y), mean[2] - s.splat(centre.z)];
     let rows = [broadcast(s, view.rows[0]), broadcast(s, view.rows[1]), broadcast(s, view.rows[2])];
     let z = dot(s, rows[2], d);
-    // NaN, of padding too, fails here.
+    // NaN fails here, including that of padding.
     let mut ahead = s.lt(s.splat(view.near_m), z);
     if !s.any(ahead) {
         return count;
@@ -230,8 +227,8 @@ fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
 
     let mut level = columns.load(column::LEVEL);
     if ANTIALIASED {
-        // Dimmed by what the blur adds to its area; not at all where both overflow. A needle's logarithm of 0 is far
-        // below any level that is seen.
+        // Dimmed by the area that the blur adds; not if both overflow. For a needle, the logarithm of 0 is far below
+        // any visible level.
         let ratio = s.min(sharp / determinant, s.splat(1.0));
         level = s.mul_add(s.log2(ratio), s.splat(0.5), level);
     }
@@ -258,7 +255,7 @@ fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
         tip_y: b * extent_x / a,
         extent_y,
     };
-    // The blocks of the first and the last pixel centre in the box around the ellipse.
+    // Blocks of the first and the last pixel centre in the box around the ellipse.
     let height = cover::block_height(S::LANES) as f32;
     let left = first_block(s, mean_x - extent_x, BLOCK_WIDTH as f32, view.width_px);
     let right = last_block(s, mean_x + extent_x, BLOCK_WIDTH as f32, view.width_px);
@@ -273,7 +270,7 @@ fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
         let size = [view.width_px, view.height_px];
         let [low, high] = cover::window(s, &ellipse, corner, size);
         blocks = [s.keep(fits, low), s.keep(fits, high)];
-        // Between the centres of pixels.
+        // Drops splats that lie between pixel centres.
         bits &= !s.bits(fits) | s.bits(s.lt(s.splat(0.5), low + high));
         if bits == 0 {
             return count;
@@ -343,8 +340,8 @@ fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
     count
 }
 
-// Closures are no substitute for the functions below: they are not always inlined, and then run
-// without the kernel's instructions.
+// The functions below cannot be closures: closures are not always inlined, and then run without the kernel's
+// instructions.
 
 /// Columns of some lanes of a group.
 #[derive(Clone, Copy)]
@@ -404,8 +401,7 @@ fn mix<S: Simd>(s: S, p: S::F, a: [S::F; 3], q: S::F, b: [S::F; 3]) -> [S::F; 3]
     [s.mul_add(p, a[0], q * b[0]), s.mul_add(p, a[1], q * b[1]), s.mul_add(p, a[2], q * b[2])]
 }
 
-/// Whether some pixel centre lies between `mean - extent` and `mean + extent`. NaN and overflow do
-/// not.
+/// Returns whether a pixel centre lies between `mean - extent` and `mean + extent`; false for NaN and overflow.
 #[inline(always)]
 fn inside<S: Simd>(s: S, mean: S::F, extent: S::F, size: u32) -> S::M {
     s.lt(s.splat(0.5), mean + extent)
@@ -413,8 +409,8 @@ fn inside<S: Simd>(s: S, mean: S::F, extent: S::F, size: u32) -> S::M {
         & s.lt(extent, s.splat(MAX_EXTENT_PX))
 }
 
-/// Returns the row or column of blocks of the first pixel centre at or after `low`. `ceil` is written as adding a little
-/// less than 1.
+/// Returns the row or column of blocks of the first pixel centre at or after `low`. `ceil` is written as the floor
+/// after adding slightly less than 1.
 #[inline(always)]
 fn first_block<S: Simd>(s: S, low: S::F, block: f32, size: u32) -> S::F {
     let pixel = s.max(low + s.splat(0.999_99 - 0.5), s.splat(0.0));
@@ -429,11 +425,11 @@ fn last_block<S: Simd>(s: S, high: S::F, block: f32, size: u32) -> S::F {
     s.floor(pixel * s.splat(1.0 / block))
 }
 
-/// Returns the colour of a vector of splats seen along unit directions; the vector form of
+/// Returns the colour of a vector of splats along unit viewing directions; the vector form of
 /// [`crate::harmonics::colour`].
 #[inline(always)]
 fn colour<S: Simd>(s: S, sh: &[u16], [x, y, z]: [S::F; 3]) -> [S::F; 3] {
-    // The slice starts at a lane: its last coefficient may be cut, so whole ones are rounded up.
+    // The slice starts at a lane, so its last coefficient may be cut: the count is rounded up.
     let coefficients = sh.len().div_ceil(3 * GROUP);
     let half = s.splat(0.5);
     let mut rgb = [half; 3];
@@ -466,10 +462,10 @@ fn colour<S: Simd>(s: S, sh: &[u16], [x, y, z]: [S::F; 3]) -> [S::F; 3] {
     [s.max(rgb[0], zero), s.max(rgb[1], zero), s.max(rgb[2], zero)]
 }
 
-/// Returns colours seen from a distance [m]; the vector form of [`Atmosphere::attenuate`].
+/// Returns colours after light and fog at a distance [m]; the vector form of [`Atmosphere::attenuate`].
 #[inline(always)]
 fn attenuate<S: Simd>(s: S, atmosphere: &Atmosphere, rgb: [S::F; 3], distance: S::F) -> [S::F; 3] {
-    // Within the range of `exp2`; a millionth of a millionth is left there.
+    // Clamped to the range of `exp2`; the remaining light is then 1e-12.
     let lost = distance * s.splat(-atmosphere.fog_per_m * std::f32::consts::LOG2_E);
     let left = s.exp2(s.max(lost, s.splat(-40.0)));
     let mut seen = rgb;

@@ -1,13 +1,12 @@
-//! The renderers' own copy of a scene, of which the one for graphics cards is made too: reordered, precomputed, packed for
-//! vectors. What stands still is one part, every rigid object another: a part that moves is rendered as one that stands
-//! still before a camera that moves.
+//! Packed copy of a scene for the renderers, also for those on graphics cards: reordered, precomputed, and laid out
+//! for vectors. The static part is one part, each rigid object another. A moving object before a camera is the same
+//! as a static object before a moving camera.
 //!
-//! Splats stand in blocks ([`crate::blocks`]). Within a block, groups of 16 splats hold column after column
-//! (16 x, 16 y, ...), so that a vector of 8 or 16 lanes is one load. What would be dropped from
-//! every image (opacity below 1/255, numbers that are not finite) is dropped here, once.
+//! Splats are in blocks ([`crate::blocks`]). Within a block, groups of 16 splats are stored column by column (16 x,
+//! 16 y, ...), so that one load fills a vector of 8 or 16 lanes. Splats that no image would show (opacity below
+//! 1/255, numbers that are not finite) are removed once, here.
 //!
-//! Memory: 52 bytes per splat and 6, 24, 54 or 96 for its harmonics as f16; coarser levels, where
-//! asked for, a third more.
+//! Memory: 52 bytes per splat, and 6, 24, 54 or 96 for its harmonics as f16. Coarser levels add a third.
 
 use glam::Vec3;
 use half::f16;
@@ -19,62 +18,62 @@ use crate::Splats;
 use crate::blocks::{self, Bounds};
 
 pub(super) use crate::blocks::BLOCK;
-/// Splats per group: the widest vector.
+/// Splats per group: lanes of the widest vector.
 pub(crate) const GROUP: usize = 16;
 
-/// Columns of a group.
+/// Indices of a group's columns.
 pub(crate) mod column {
     /// Centre, x y z. [m, world]
     pub(crate) const MEAN: usize = 0;
-    /// The square root of the covariance: axes times scales, column by column. [m, world]
+    /// Square root of the covariance: axes times scales, column by column. [m, world]
     pub(crate) const AXES: usize = 3;
-    /// log2 of the opacity.
+    /// Binary logarithm of the opacity.
     pub(crate) const LEVEL: usize = 12;
-    /// How many.
+    /// Number of columns.
     pub(crate) const COUNT: usize = 13;
 }
 
-/// Numbers of one group's geometry.
+/// Number of values of one group's geometry.
 pub(crate) const GROUP_NUMBERS: usize = column::COUNT * GROUP;
 
 /// Bounds of [`BLOCK`] consecutive splats.
 #[allow(clippy::struct_field_names, reason = "metres, all of them")]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Block {
-    /// Middle of the box around the centres. [m, world]
+    /// Centre of the box around the splats' centres. [m, world]
     pub(crate) center_m: Vec3,
-    /// Half the sides of that box. [m]
+    /// Half side lengths of that box. [m]
     pub(crate) half_m: Vec3,
-    /// The greatest distance from its centre at which a splat of the block still counts. [m]
+    /// Maximum distance from its centre at which a splat of the block is visible. [m]
     pub(crate) reach_m: f32,
-    /// How far its splats are from what they stand for, as root mean square; 0 for the scene's own
+    /// Root mean square distance of the block's splats from the finer splats that they replace; 0 for original
     /// splats. [m]
     pub(crate) error_m: f32,
 }
 
-/// What stands still, or one rigid object; packed in its own frame.
+/// Static part or one rigid object; packed in its own frame.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Part {
-    /// What the image of ids shows.
+    /// Value in the image of ids.
     pub(crate) id: u16,
-    /// Level by level, the finest first.
+    /// Blocks level by level, the finest first.
     pub(crate) blocks: Vec<Block>,
-    /// The first block of each level; at least one.
+    /// First block of each level; at least one level.
     pub(crate) levels: Vec<usize>,
-    /// [`GROUP_NUMBERS`] per group, whole blocks; the last is padded with centres that are NaN.
+    /// [`GROUP_NUMBERS`] values per group, whole blocks; the last block is padded with NaN centres.
     pub(crate) geometry: Vec<f32>,
-    /// Halves: per group, coefficient by coefficient, RGB within, 16 splats each.
+    /// Harmonics as f16: per group, coefficient by coefficient, in each RGB, 16 splats each.
     pub(crate) sh: Vec<u16>,
     /// Coefficients per colour channel.
     pub(crate) coefficients: usize,
-    /// Splats kept.
+    /// Number of packed splats.
     pub(crate) len: usize,
     /// [`Splats::antialiased`].
     pub(crate) antialiased: bool,
 }
 
 impl Part {
-    /// Packs splats, and their coarser levels where asked for.
+    /// Packs splats, and adds coarser levels if `detail` is adaptive.
     pub(super) fn new(id: u16, splats: &Splats, detail: Detail) -> Self {
         let mut part = Self::packed(id, splats);
         if let Detail::Adaptive { max_error_px } = detail {
@@ -83,7 +82,7 @@ impl Part {
         part
     }
 
-    /// Returns how many numbers the harmonics of a splat are.
+    /// Returns the number of harmonics values per splat.
     pub(crate) fn sh_numbers(&self) -> usize {
         self.coefficients * 3
     }
@@ -112,11 +111,11 @@ impl Part {
                     }
                     put(column::LEVEL, splats.opacities[i].log2());
                 }
-                // Coefficient by coefficient: sixteen at once convert in one instruction or two.
+                // Coefficient by coefficient: one or two instructions convert sixteen values.
                 for (k, halves) in sh.chunks_exact_mut(GROUP).enumerate() {
                     let mut lanes = [0f32; GROUP];
                     for (lane, &i) in lanes.iter_mut().zip(order) {
-                        // Clamped: f16 ends at 65504, and an infinity would become NaN.
+                        // Clamped: the maximum of f16 is 65504, and an infinity would become NaN.
                         *lane = splats.sh[i as usize * sh_numbers / GROUP + k].clamp(-6e4, 6e4);
                     }
                     halves.reinterpret_cast_mut::<f16>().convert_from_f32_slice(&lanes);

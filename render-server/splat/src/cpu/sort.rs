@@ -1,11 +1,11 @@
-//! Pass 3: slots of projected splats, nearest first.
+//! Pass 3: sorts the slots of projected splats from near to far.
 //!
-//! A parallel radix sort, least significant digit first: two stable passes of 11 bits. Depths are
-//! f32 bits less the nearest's, shifted so that the range fits 22 bits: a scene from 0.2 to 50 m is
-//! ordered to 2e-6 relative, finer than one f32 projection differs from another.
+//! Parallel radix sort, least significant digit first: two stable passes of 11 bits. Keys are the f32 bits of the
+//! depth minus those of the nearest, shifted so that the range fits 22 bits. A scene from 0.2 to 50 m is ordered to
+//! 2e-6 relative, less than the difference between two f32 projections.
 //!
-//! Each slice counts its digits, the counts give every slice its places, and all slices scatter at
-//! once. The places are disjoint, but no borrow can say so: the arrays are relaxed atomics, which
+//! Each slice counts its digits. The counts determine the output positions of every slice, and all slices scatter at
+//! once. The positions are disjoint, but the borrow checker cannot prove that: the arrays are relaxed atomics, which
 //! compile to plain moves.
 //!
 //! Budget: 16 bytes moved per splat and pass, 2-4 ns per splat and thread.
@@ -19,25 +19,25 @@ use super::scene::BLOCK;
 
 const DIGIT_BITS: u32 = 11;
 const BINS: usize = 1 << DIGIT_BITS;
-/// Below this a second slice costs more than it saves.
+/// Minimum slice; for smaller inputs, a second slice costs more than it saves.
 const MIN_SLICE: usize = 4096;
 
 /// Buffers of the sort, and its result.
 #[derive(Debug, Default)]
 pub(super) struct Sorter {
-    /// Key in the upper half, slot in the lower, by the first digit.
+    /// Result of the first pass: key in the upper half, slot in the lower half.
     half_sorted: Vec<AtomicU64>,
-    /// Slots, nearest first; the first `len`.
+    /// Slots from near to far; the first `len` are valid.
     order: Vec<AtomicU32>,
     len: usize,
-    /// Per slice.
+    /// Digit counts per slice.
     histograms: Vec<Vec<u32>>,
-    /// First regions of the slices, and one past the last.
+    /// First region of each slice, and the end of the last slice.
     bounds: Vec<usize>,
 }
 
 impl Sorter {
-    /// Returns the slots, nearest first.
+    /// Returns the slots from near to far.
     pub(super) fn order(&self) -> &[AtomicU32] {
         &self.order[..self.len]
     }
@@ -51,7 +51,7 @@ impl Sorter {
             self.order.resize_with(len, AtomicU32::default);
         }
         let slices = (len / MIN_SLICE).clamp(1, rayon::current_num_threads());
-        // Never fewer than before: their memory is kept.
+        // Never fewer than before, to keep their memory.
         if self.histograms.len() < slices {
             self.histograms.resize_with(slices, || vec![0; BINS]);
         }
@@ -63,7 +63,7 @@ impl Sorter {
         let keys = |region: usize| {
             projected.keys[region * BLOCK..][..projected.counts[region] as usize].iter()
         };
-        // 22 bits, so that the upper digit needs no mask.
+        // Keys have 22 bits, so the upper digit needs no mask.
         let compact = |key: u32| (key - least) >> shift;
         let low = |key: u32| key as usize % BINS;
         let high = |key: u32| (key >> DIGIT_BITS) as usize % BINS;
@@ -108,7 +108,7 @@ impl Sorter {
         });
     }
 
-    /// Splits the regions into slices of about as many splats.
+    /// Splits the regions into slices with similar numbers of splats.
     fn split_regions(&mut self, counts: &[u32], len: usize, slices: usize) {
         self.bounds.clear();
         self.bounds.push(0);
@@ -123,7 +123,7 @@ impl Sorter {
     }
 }
 
-/// Returns the least key, and the shift that brings every key less it into two digits.
+/// Returns the minimum key, and the shift after which the difference of any key to it fits two digits.
 fn key_range(projected: &Projected) -> (u32, u32) {
     let (least, greatest) = projected
         .counts
@@ -140,7 +140,7 @@ fn key_range(projected: &Projected) -> (u32, u32) {
     (least, bits.saturating_sub(2 * DIGIT_BITS))
 }
 
-/// Turns counts per slice and digit into the place of each slice's first entry of each digit.
+/// Converts counts per slice and digit into the output position of each slice's first entry of each digit.
 fn to_places(histograms: &mut [Vec<u32>]) {
     let mut place = 0;
     for bin in 0..BINS {
@@ -169,7 +169,7 @@ mod tests {
             }
         }
         let mut sorter = Sorter::default();
-        // Twice: what the first run leaves behind must not matter.
+        // Twice, because the state after the first run must not matter.
         sorter.sort(&projected);
         sorter.sort(&projected);
         sorter.order().iter().map(|slot| slot.load(Relaxed)).collect()

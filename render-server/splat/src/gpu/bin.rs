@@ -1,7 +1,7 @@
-//! Pass 3: which splats touch which tile, in any order.
+//! Pass 3: lists the splats that touch each tile, in any order.
 //!
-//! Budget: 16 bytes read per slot, 8 written per pair at places that one atomic per pair gives; two
-//! dispatches, and 12 bytes per tile.
+//! Budget: 16 bytes read per slot; 8 written per pair, at positions that one atomic per pair returns; two dispatches,
+//! and 12 bytes per tile.
 
 use super::buffers::Buffers;
 use super::device::{Device, Groups, Kernel};
@@ -14,14 +14,14 @@ const SOURCE: &str = concat!(
     include_str!("bin.wgsl")
 );
 
-/// The pass.
+/// Pass with its kernels.
 #[derive(Debug)]
 pub(super) struct Bin {
     place: Kernel,
     emit: Kernel,
 }
 
-/// Its buffers, bound.
+/// Bindings of the buffers.
 #[derive(Debug)]
 pub(super) struct BinBindings {
     place: wgpu::BindGroup,

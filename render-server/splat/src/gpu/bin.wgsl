@@ -1,22 +1,22 @@
-// Pass 3: the list of each tile's splats, in any order; `sort` puts it right.
+// Pass 3: lists the splats of each tile, in any order; `sort` sorts the lists.
 //
-// `project` has counted each tile's splats: `place` turns the counts into places, `emit` writes there.
+// `project` has counted the splats of each tile: `place` converts the counts to positions, and `emit` writes there.
 
 @group(0) @binding(0) var<uniform> tick: Tick;
 @group(0) @binding(1) var<storage, read> views: array<View>;
 @group(0) @binding(2) var<storage, read_write> sizes: array<u32>;
 @group(0) @binding(3) var<storage, read> covers: array<Cover>;
-// Splats per tile, those of all images; `place` leaves the first pair of each tile here.
+// Splats per tile, then those of all images; `place` replaces each tile's count by its first pair.
 @group(0) @binding(4) var<storage, read_write> counts: array<u32>;
-// The same, but one past the tile's last pair once `emit` has run.
+// The same, but the end of the tile's pairs after `emit` has run.
 @group(0) @binding(5) var<storage, read_write> ends: array<atomic<u32>>;
 // Depth as bits, slot.
 @group(0) @binding(6) var<storage, read_write> pairs: array<vec2<u32>>;
 
-/// Tiles per thread at once.
+/// Number of tiles per thread and iteration.
 const EACH = 4u;
 
-// One workgroup: turns numbers of pairs into first pairs.
+// One workgroup: converts numbers of pairs to first pairs.
 @compute @workgroup_size(256)
 fn place(@builtin(local_invocation_index) thread: u32) {
     var carry = 0u;
@@ -37,7 +37,7 @@ fn place(@builtin(local_invocation_index) thread: u32) {
                 atomicStore(&ends[own + i], before + places[i]);
             }
         }
-        // Saturates: more pairs than 2^32 are more than there is room for, not fewer.
+        // Saturates: an overflow of 2^32 pairs must not appear as fewer pairs.
         carry = select(carry + scan_total, 0xffffffffu, carry + scan_total < carry);
         workgroupBarrier();
     }
@@ -48,7 +48,7 @@ fn place(@builtin(local_invocation_index) thread: u32) {
     }
 }
 
-/// Splats of tiles that a thread has on their way at once: an atomic's answer takes long.
+/// Number of tiles that a thread processes concurrently, to hide the latency of atomics.
 const AT_ONCE = 4u;
 
 // One workgroup per region.
@@ -58,7 +58,7 @@ fn emit(
     @builtin(local_invocation_index) thread: u32,
 ) {
     let slot = group.x * BLOCK + thread;
-    // With no room for all pairs there will be another try.
+    // Too little room for all pairs: the tick is rendered again.
     var own = nothing();
     if sizes[PAIRS_WANTED] <= tick.pairs {
         own = covers[slot];
@@ -82,7 +82,7 @@ fn emit(
             whose[i] = owner(min(tile, large_tiles - 1u));
             let cover = large[whose[i]];
             let across = views[(cover.size >> 20u) * tick.parts].size.z;
-            // Beyond the last there is none: a tile beyond its rectangle.
+            // After the last tile: an index outside of the rectangle.
             places[i] = place_in(cover, select(NO_TILE, tile - starts[whose[i]], tile < large_tiles), across);
         }
         for (var i = 0u; i < AT_ONCE; i++) {
@@ -91,7 +91,7 @@ fn emit(
     }
 }
 
-/// Returns a place in the list of a tile of a rectangle; NO_PLACE if the ellipse does not reach that.
+/// Returns a position in the list of a tile of a rectangle; NO_PLACE if the ellipse does not reach the tile.
 fn place_in(cover: Cover, index: u32, tiles_x: u32) -> u32 {
     if index < columns(cover) * rows(cover) {
         let tile = tile_of(cover, index, tiles_x);

@@ -1,8 +1,7 @@
-//! Pass 5: the pixels of each tile, from near to far.
+//! Pass 5: blends the pixels of each tile from near to far.
 //!
-//! Budget: 48 bytes read per pair that is not behind opaque ones, 16 written per pixel (20 with
-//! ids). Bound by arithmetic: some 10 operations per splat and pixel of a patch that it reaches, 25 where
-//! it is seen.
+//! Budget: 48 bytes read per pair that is not hidden by opaque ones, 16 written per pixel (20 with ids). Limited by
+//! arithmetic: about 10 operations per splat and pixel of a patch that the splat reaches, 25 if it is visible there.
 
 use super::buffers::Buffers;
 use super::device::{Device, Groups, Kernel, Slice};
@@ -10,11 +9,11 @@ use super::device::{Device, Groups, Kernel, Slice};
 const SOURCE: &str =
     concat!(include_str!("common.wgsl"), include_str!("ellipse.wgsl"), include_str!("blend.wgsl"));
 
-/// What pixels and ids are written to.
+/// Bindings of the output: pixels and ids.
 #[derive(Debug)]
 pub(super) struct Output(wgpu::BindGroup);
 
-/// The pass.
+/// Pass with its kernel.
 #[derive(Debug)]
 pub(super) struct Blend {
     kernel: Kernel,
@@ -40,7 +39,7 @@ impl Blend {
         )
     }
 
-    /// Binds what pixels and ids are written to.
+    /// Binds the output: pixels and ids.
     pub(super) fn bind_output(&self, device: &Device, pixels: Slice<'_>, ids: Slice<'_>) -> Output {
         Output(device.bind_group(&self.kernel, 1, &[(0, pixels), (1, ids)]))
     }

@@ -1,7 +1,7 @@
-// Pass 5: the pixels of each tile, from near to far. One workgroup per tile, a thread per pixel. Lists are
-// taken in batches through workgroup memory, until every pixel of the tile has ended. The thread that
-// fetches a splat also finds which of the tile's eight patches of 8x4 pixels it reaches: threads of a patch,
-// which are neighbours, walk the splats of their patch alone.
+// Pass 5: blends the pixels of each tile from near to far. One workgroup per tile, one thread per pixel. Lists are
+// processed in batches through workgroup memory, until every pixel of the tile has ended. The thread that fetches a
+// splat also finds which of the tile's eight patches of 8x4 pixels it reaches: the threads of a patch, which are
+// neighbours, process only the splats of their patch.
 
 @group(0) @binding(0) var<uniform> tick: Tick;
 @group(0) @binding(1) var<storage, read> views: array<View>;
@@ -16,31 +16,31 @@
 
 const ALPHA_MAX = 0.99;
 const TRANSMITTANCE_MIN = 1e-4;
-/// f16 ends at 65504.
+/// The maximum of f16 is 65504.
 const COLOUR_MAX = 65000.0;
-/// Workgroups along x at most.
+/// Maximum number of workgroups along x.
 const GRID = 32768u;
 
 const NO_PAIR = 0xffffffffu;
 const THREADS = 256u;
 const BATCH = 256u;
-/// Threads of a patch, columns and rows of it, patches across a tile, and in a tile.
+/// Threads per patch; columns and rows of a patch; patches across a tile; patches per tile.
 const PATCH = 32u;
 const PATCH_SIZE = vec2(8u, 4u);
 const ACROSS = 2u;
 const PATCHES = 8u;
-/// What rounding may move an ellipse's edge by. [px]
+/// Maximum rounding error of an ellipse's edge. [px]
 const SLACK = 0.01;
 
 var<workgroup> batch: array<Projected, BATCH>;
-/// Bit b of word w, patch p: splat 32 w + b of the batch reaches it. Patch by patch.
+/// Bit b of word w of patch p is set if splat 32 w + b of the batch reaches it. Stored patch by patch.
 var<workgroup> reached: array<atomic<u32>, 64>;
-/// Threads whose pixel has ended.
+/// Number of threads whose pixel has ended.
 var<workgroup> ended: atomic<u32>;
 var<workgroup> ended_before: u32;
 var<workgroup> own_list: vec2<u32>;
 
-/// Notes which patches of a tile a splat of the batch reaches.
+/// Stores which patches of a tile a splat of the batch reaches.
 fn note_patches(i: u32, splat: Projected, origin: vec2<f32>) {
     let extent = splat.extent;
     let reach = extent.y - MIN_LEVEL;
@@ -83,7 +83,7 @@ fn blend(
     let pixel = origin + vec2(own_patch % ACROSS, own_patch / ACROSS) * PATCH_SIZE
         + vec2(thread % PATCH_SIZE.x, thread % PATCH / PATCH_SIZE.x);
     let at = vec2<f32>(pixel) + 0.5;
-    // Pixels beyond the image's edge have ended before they start.
+    // Pixels beyond the image's edge start as ended.
     let exists = all(pixel < size.xy);
     var goes_on = exists;
     if thread == 0u {
@@ -96,16 +96,16 @@ fn blend(
     }
 
     var seen = vec4(0.0);
-    // The pair at which transmittance fell to one half; NO_PAIR where it did not.
+    // Pair at which transmittance fell to one half; NO_PAIR if it did not.
     var median = NO_PAIR;
     var transmittance = 1.0;
-    // What a thread fetches is on its way while the batch before is walked.
+    // The next splat is fetched while the current batch is processed.
     var fetched: Projected;
     if list.x + thread < list.y {
         fetched = projected[pairs[list.x + thread].y];
     }
     for (var first = list.x; first < list.y; first += BATCH) {
-        // Nobody reads the last batch any more.
+        // After this barrier, the last batch is no longer read.
         workgroupBarrier();
         if thread == 0u {
             ended_before = atomicLoad(&ended);
@@ -133,7 +133,7 @@ fn blend(
             var shape = batch[i].shape;
             var extent = batch[i].extent;
             loop {
-                // The next one's numbers are on their way while this one is blended.
+                // The values of the next splat are loaded while this one is blended.
                 left &= left - 1u;
                 let next = select(i, word * 32u + firstTrailingBit(left), left != 0u);
                 let next_shape = batch[next].shape;
@@ -144,7 +144,7 @@ fn blend(
                 if level > MIN_LEVEL {
                     let alpha = min(exp2(level), ALPHA_MAX);
                     let after = transmittance - alpha * transmittance;
-                    // A pixel ends before the splat that would bring it here.
+                    // A pixel ends before the splat that would reduce its transmittance to this value.
                     if after <= TRANSMITTANCE_MIN {
                         goes_on = false;
                         atomicAdd(&ended, 1u);

@@ -1,18 +1,18 @@
-//! What passes leave for each other; kept from tick to tick, and only ever grown.
+//! Buffers between passes; reused for each tick, and only ever grown.
 //!
-//! Two sizes depend on what a camera sees, and are known to the device alone: regions (256 slots,
-//! one per visible block) and pairs (of tile and splat). The device counts what it wants and uses
-//! what there is; the counts come back with the images, and where there was too little the buffers
-//! are grown and the tick is rendered again (`read.rs`).
+//! Two sizes depend on what a camera sees, and are known only on the device: regions (256 slots, one per visible
+//! block) and pairs (of tile and splat). The device counts the required number and uses the available room. The
+//! counts are read with the images; if the room was too small, the buffers grow and the tick is rendered again
+//! (`read.rs`).
 //!
-//! Memory: 64 bytes per slot, 16 per pair, 4 per camera and block, 8 per tile; 16 (20 with objects)
-//! per pixel for each of two staging buffers, and once more where shaders cannot write these.
+//! Memory: 64 bytes per slot, 16 per pair, 4 per camera and block, 8 per tile; 16 per pixel (20 with objects) for
+//! each of two staging buffers, and once more if shaders cannot write to these.
 
 use super::device::Device;
 use super::view::GpuView;
 use crate::blocks::BLOCK;
 
-/// How much there must be room for.
+/// Capacity of the buffers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Capacity {
     /// Cameras times parts.
@@ -26,13 +26,13 @@ pub(super) struct Capacity {
 }
 
 impl Capacity {
-    /// Returns the greatest that a device can give.
+    /// Returns the maximum capacity of a device.
     pub(super) fn limit(binding_bytes: u64) -> Self {
-        // One workgroup writes a region's pairs; there are 65535 of them at most.
+        // One workgroup writes the pairs of a region, and a dispatch has at most 65535 workgroups.
         let regions = (binding_bytes / PROJECTED_BYTES / BLOCK as u64).min(65_535);
         Self {
             views: binding_bytes / size_of::<GpuView>() as u64,
-            // Ranks, and a number per workgroup.
+            // Ranks, and one number per workgroup.
             camera_blocks: (binding_bytes / 4 * 255 / 256).min(65_535 * 256),
             regions,
             pairs: binding_bytes / 8,
@@ -41,17 +41,17 @@ impl Capacity {
         }
     }
 
-    /// Whether it holds another.
+    /// Returns whether it is at least as large as another capacity.
     pub(super) fn holds(&self, other: &Self) -> bool {
         self.pairwise(other).iter().all(|(has, wants)| has >= wants)
     }
 
-    /// Whether a device can give it.
+    /// Returns whether it is within the device's limit.
     pub(super) fn is_within(&self, limit: &Self) -> bool {
         self.pairwise(limit).iter().all(|(wants, limit)| wants <= limit)
     }
 
-    /// Returns room for another too, a quarter more than what has to grow, within a limit.
+    /// Returns a capacity that also holds `other`; sizes that must grow get a quarter more, within the limit.
     pub(super) fn grown_to(&self, other: &Self, limit: &Self) -> Self {
         Self {
             views: grown(self.views, other.views, limit.views),
@@ -75,12 +75,12 @@ impl Capacity {
     }
 }
 
-/// Returns room for what is wanted, within a limit: a quarter more where there is less.
+/// Returns the new size of a buffer: unchanged if sufficient, otherwise a quarter more than wanted, within the limit.
 pub(super) fn grown(has: u64, wants: u64, limit: u64) -> u64 {
     if has >= wants { has } else { (wants + wants / 4).min(limit) }
 }
 
-/// The buffers; named as in the shaders.
+/// Buffers, named as in the shaders.
 #[derive(Debug)]
 pub(super) struct Buffers {
     pub(super) capacity: Capacity,
@@ -91,18 +91,18 @@ pub(super) struct Buffers {
     pub(super) dispatches: wgpu::Buffer,
     pub(super) projected: wgpu::Buffer,
     pub(super) covers: wgpu::Buffer,
-    /// Splats per tile, and of all images; then each tile's first pair.
+    /// Splats per tile and of all images; later the first pair of each tile.
     pub(super) firsts: wgpu::Buffer,
-    /// One past each tile's last pair.
+    /// End of the pairs of each tile.
     pub(super) ends: wgpu::Buffer,
     pub(super) pairs: [wgpu::Buffer; 2],
     pub(super) pixels: wgpu::Buffer,
     pub(super) ids: wgpu::Buffer,
 }
 
-/// Bytes of `Projected` of `common.wgsl`.
+/// Size of `Projected` of `common.wgsl`. [byte]
 const PROJECTED_BYTES: u64 = 48;
-/// Bytes of `sizes`.
+/// Size of `sizes`. [byte]
 pub(super) const SIZES_BYTES: u64 = 32;
 
 impl Buffers {

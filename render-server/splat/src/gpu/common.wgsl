@@ -1,63 +1,63 @@
-// What all passes share. Put before each of them.
+// Definitions shared by all passes; prepended to each of them.
 
-/// Sizes of a tick: all its cameras at once.
+/// Sizes of a tick, for all its cameras.
 struct Tick {
     cameras: u32,
     parts: u32,
-    /// Blocks of all parts.
+    /// Number of blocks of all parts.
     blocks: u32,
-    /// Tiles of all cameras.
+    /// Number of tiles of all cameras.
     tiles: u32,
-    /// Regions there is room for, of BLOCK slots each.
+    /// Capacity in regions of BLOCK slots.
     regions: u32,
-    /// (Tile, slot) pairs there is room for.
+    /// Capacity in (tile, slot) pairs.
     pairs: u32,
     has_ids: u32,
-    /// How far splats may be rendered from where they are. [px]
+    /// Maximum error of the position of splats. [px]
     max_error: f32,
 }
 
-/// A camera as one part of the scene sees it. `view.rs` holds the same in Rust.
+/// Camera as seen from one part of the scene. `GpuView` of `view.rs` has the same layout in Rust.
 struct View {
-    /// Row of the rotation to the camera's axes; the camera's centre, x.
+    /// Row of the rotation into the camera's axes; x of the camera's centre.
     row_x: vec4<f32>,
-    /// ... y.
+    /// Same for y.
     row_y: vec4<f32>,
-    /// ... z.
+    /// Same for z.
     row_z: vec4<f32>,
     /// fx fy cx cy. [px]
     focal: vec4<f32>,
-    /// Slopes between which a splat is linearised: least x, y, greatest x, y.
+    /// Bounds of the slopes at which a splat is linearised: minimum x, y, maximum x, y.
     slopes: vec4<f32>,
-    /// The lens's first four coefficients, in the order of OpenCV.
+    /// First four coefficients of the lens, in the order of OpenCV.
     lens: vec4<f32>,
-    /// Its fifth; the greatest slope it images; near plane [m]; 1 if the part is anti-aliased.
+    /// Fifth coefficient; maximum slope of the lens; near plane [m]; 1 if the part is anti-aliased.
     more: vec4<f32>,
-    /// What is seen of it through the air.
+    /// Background after light and fog.
     background: vec4<f32>,
-    /// Factor of every colour; log2 of what fog takes per metre.
+    /// Factor of every colour; log2 of the fog's attenuation per metre.
     light: vec4<f32>,
-    /// Colour of fog.
+    /// Colour of the fog.
     fog: vec4<f32>,
     /// Width, height [px], tiles across, first tile.
     size: vec4<u32>,
-    /// Lens model, 1 if the part is there, first pixel, id.
+    /// Lens model, 1 if the part is present, first pixel, id.
     flags: vec4<u32>,
-    /// A splat at p may be seen where all `normal . (p - centre) + reach * weight >= offset`.
+    /// A splat at p may be visible if all `normal . (p - centre) + reach * weight >= offset`.
     planes: array<vec4<f32>, 5>,
     weights: array<vec4<f32>, 2>,
 }
 
-/// Splats of a block, threads of a workgroup.
+/// Splats per block, and threads per workgroup.
 const BLOCK = 256u;
 /// Side of a tile. [px]
 const TILE = 16u;
-/// log2(1/255): below this level a splat is not seen.
+/// log2(1/255): minimum level of a visible splat.
 const MIN_LEVEL = -7.9943535;
-/// The key of a slot without a splat.
+/// Key of a slot without a splat.
 const EMPTY = 0xffffffffu;
 
-/// A splat on the image plane. Training keeps the three in buffers of their own.
+/// Splat on the image plane. Training stores the three fields in separate buffers.
 struct Projected {
     /// Mean x, y [px], shear, falloff along x [1/px^2].
     shape: vec4<f32>,

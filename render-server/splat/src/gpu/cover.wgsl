@@ -1,28 +1,28 @@
-// Which tiles a splat touches: found once, by `project`, and read by `emit`, so that both count alike.
+// Tiles that a splat touches: computed once, by `project`, and read by `emit`, so that both count the same tiles.
 //
-// Tiles are those of a rectangle, in cells of 8 columns and 4 rows: of a tile each in a rectangle no larger
-// than that, of several in a larger one. A workgroup walks the tiles of its 256 splats together: each thread
-// those of its own small rectangle, then all of them those of the large ones.
+// The tiles form a rectangle that is divided into at most 8 x 4 cells. A cell is one tile in a rectangle of at most
+// 8 x 4 tiles, otherwise several tiles. A workgroup processes the tiles of its 256 splats
+// together: first each thread those of its own small rectangle, then all threads those of the large rectangles.
 
-/// A splat in an image of so many tiles across.
+/// Touched tiles of a splat.
 struct Cover {
-    /// The rectangle's first tile.
+    /// First tile of the rectangle.
     first: u32,
     /// Columns; rows << 10; camera << 20.
     size: u32,
-    /// A bit per cell, row by row, that the ellipse reaches.
+    /// Bits of the cells that the ellipse reaches, row by row.
     cells: u32,
-    /// Camera z as bits, which order as the positive numbers do.
+    /// Camera z as bits; for positive numbers their order is the same.
     key: u32,
 }
 
 const CELL_COLUMNS = 8u;
 const CELL_ROWS = 4u;
 const NO_TILE = 0xffffffffu;
-/// Tiles of a rectangle that one thread walks alone.
+/// Maximum number of tiles of a rectangle that one thread processes.
 const ALONE = 8u;
 
-/// Is the cover of a slot without a splat.
+/// Returns the cover of a slot without a splat.
 fn nothing() -> Cover {
     return Cover(0u, 0u, 0u, 0u);
 }
@@ -35,7 +35,7 @@ fn rows(cover: Cover) -> u32 {
     return cover.size >> 10u & 1023u;
 }
 
-/// Returns the tiles from column to column, and from row to row, of a cell.
+/// Returns the size of a cell in tiles: columns and rows.
 fn cell_size(cover: Cover) -> vec2<u32> {
     return vec2(
         (columns(cover) + CELL_COLUMNS - 1u) / CELL_COLUMNS,
@@ -43,7 +43,7 @@ fn cell_size(cover: Cover) -> vec2<u32> {
     );
 }
 
-/// Returns a tile of the rectangle, counted row by row; NO_TILE where the ellipse does not reach its cell.
+/// Returns a tile of the rectangle, numbered row by row; NO_TILE if the ellipse does not reach its cell.
 fn tile_of(cover: Cover, index: u32, tiles_x: u32) -> u32 {
     let at = vec2(index % columns(cover), index / columns(cover));
     let cell = at / cell_size(cover);
@@ -51,18 +51,18 @@ fn tile_of(cover: Cover, index: u32, tiles_x: u32) -> u32 {
     return select(NO_TILE, cover.first + at.y * tiles_x + at.x, is_touched);
 }
 
-/// Returns the number of tiles of the rectangle, if the splat's own thread walks them.
+/// Returns the number of tiles of the rectangle, if the splat's own thread processes them.
 fn tiles_alone(cover: Cover) -> u32 {
     let tiles = columns(cover) * rows(cover);
     return select(0u, tiles, tiles <= ALONE);
 }
 
 var<workgroup> large: array<Cover, 256>;
-/// Tiles of large rectangles before each thread's.
+/// Number of tiles of large rectangles before each thread's.
 var<workgroup> starts: array<u32, 256>;
 var<workgroup> large_tiles: u32;
 
-/// Notes each thread's rectangle if it is large; returns their tiles. Every thread must call it.
+/// Stores each thread's rectangle if it is large; returns their number of tiles. Every thread must call it.
 fn share(thread: u32, cover: Cover) -> u32 {
     let tiles = columns(cover) * rows(cover);
     let before = scan(thread, select(0u, tiles, tiles > ALONE));
@@ -74,9 +74,9 @@ fn share(thread: u32, cover: Cover) -> u32 {
     return workgroupUniformLoad(&large_tiles);
 }
 
-/// Returns whose rectangle a tile of `share` is of.
+/// Returns the thread whose rectangle contains a tile of `share`.
 fn owner(tile: u32) -> u32 {
-    // The last that starts at or before it: those without tiles start where the next does.
+    // The last one that starts at or before it: threads without tiles start where the next thread does.
     var low = 0u;
     for (var step = 128u; step > 0u; step /= 2u) {
         if starts[low + step] <= tile {

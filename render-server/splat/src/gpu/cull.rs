@@ -1,7 +1,7 @@
-//! Pass 1: which blocks each camera may see, of coarser ones those that do.
+//! Pass 1: finds the blocks that each camera may see, at the coarsest sufficient level.
 //!
-//! Budget: 48 bytes read per block of 256 splats and camera, and of those above it in adaptive detail; 4 written; two
-//! dispatches, some 5 us per million splats.
+//! Budget: 48 bytes read per camera and block of 256 splats, and for its ancestors in adaptive detail; 4 written; two
+//! dispatches, about 5 us per million splats.
 
 use super::buffers::Buffers;
 use super::device::{Device, Groups, Kernel};
@@ -14,14 +14,14 @@ const SOURCE: &str = concat!(
     include_str!("cull.wgsl")
 );
 
-/// The pass.
+/// Pass with its kernels.
 #[derive(Debug)]
 pub(super) struct Cull {
     cull: Kernel,
     place: Kernel,
 }
 
-/// Its buffers, bound.
+/// Bindings of the buffers.
 #[derive(Debug)]
 pub(super) struct CullBindings {
     cull: wgpu::BindGroup,
@@ -64,7 +64,7 @@ impl Cull {
         }
     }
 
-    /// Runs for `count` pairs of camera and block.
+    /// Runs the pass for `count` pairs of camera and block.
     pub(super) fn run(
         &self,
         pass: &mut wgpu::ComputePass<'_>,

@@ -1,17 +1,17 @@
-// Pass 1: which blocks of splats each camera may see, and the region of slots of each. Of a tree of blocks, everywhere the
-// coarsest that is off by little enough, as `cpu/cull.rs`.
+// Pass 1: finds the blocks of splats that each camera may see, and assigns each a region of slots. Of a tree of
+// blocks, it selects everywhere the coarsest one with a sufficiently small error, like `cpu/cull.rs`.
 
 struct Block {
-    /// Middle of the box around the centres. [m, part]
+    /// Centre of the box around the splats' centres. [m, part]
     center: vec3<f32>,
-    /// Greatest distance from its centre at which a splat of it still counts. [m]
+    /// Maximum distance from its centre at which a splat of the block is visible. [m]
     reach: f32,
-    /// Half the sides of that box. [m]
+    /// Half side lengths of that box. [m]
     half_size: vec3<f32>,
     part: u32,
-    /// How far its splats are from what they stand for; 0 of the scene's own. [m]
+    /// Error of its splats relative to the finer ones that they replace; 0 for original splats. [m]
     error: f32,
-    /// The block that stands for this one, or NONE.
+    /// Parent block, or NONE.
     parent: u32,
     padding: vec2<u32>,
 }
@@ -21,21 +21,21 @@ const NONE = 0xffffffffu;
 @group(0) @binding(0) var<uniform> tick: Tick;
 @group(0) @binding(1) var<storage, read> views: array<View>;
 @group(0) @binding(2) var<storage, read> blocks: array<Block>;
-// Per camera and block: 0, or 1 more than the region counted from the workgroup's first; then each
-// workgroup's number of regions, later its first.
+// Per camera and block: 0, or 1 plus the index of the region relative to the workgroup's first. Then, per workgroup:
+// its number of regions, later its first region.
 @group(0) @binding(3) var<storage, read_write> regions: array<u32>;
 @group(0) @binding(4) var<storage, read_write> sizes: array<u32>;
 // Workgroups of `emit`.
 @group(0) @binding(5) var<storage, read_write> dispatches: array<u32>;
 
-// Views by index, not by value: a copy indexed in a loop would go to memory.
+// Views are accessed by index, not by value: a copy that is indexed in a loop would be in memory.
 fn is_seen(block: Block, view: u32) -> bool {
     let center = block.center - vec3(views[view].row_x.w, views[view].row_y.w, views[view].row_z.w);
     let farthest = max(max(abs(center.x), abs(center.y)), abs(center.z));
     for (var i = 0u; i < 5u; i++) {
         let plane = views[view].planes[i];
         let slack = dot(abs(plane.xyz), block.half_size) + block.reach * views[view].weights[i / 4u][i % 4u];
-        // The rounding of the sums, so that nothing is lost at the very edge.
+        // Rounding error of the sums, so that nothing is lost at the edge.
         let rounding = 1e-5 * (farthest + slack);
         if dot(plane.xyz, center) + slack + rounding < plane.w {
             return false;
@@ -44,19 +44,20 @@ fn is_seen(block: Block, view: u32) -> bool {
     return true;
 }
 
-/// Whether a block's splats are off by little enough.
+/// Returns whether the error of a block is sufficiently small.
 fn is_fine(index: u32, view: u32) -> bool {
     let center = blocks[index].center - vec3(views[view].row_x.w, views[view].row_y.w, views[view].row_z.w);
     let ahead = views[view].row_z.xyz;
-    // Of its point that is nearest to the camera.
+    // Depth of the block's point nearest to the camera.
     let nearest = dot(ahead, center) - dot(abs(ahead), blocks[index].half_size);
     let focal = max(abs(views[view].focal.x), abs(views[view].focal.y));
     let px_per_m = focal / max(nearest, views[view].more.z);
-    // The scene's own splats always are: also where a number overflows.
+    // Original splats always are, also if a number overflows.
     return blocks[index].error == 0.0 || blocks[index].error * px_per_m <= tick.max_error;
 }
 
-/// Whether a block is the coarsest one that is fine: all above it are asked, so that rounding draws nothing twice.
+/// Returns whether a block is the coarsest sufficient one. All ancestors are tested, so that rounding cannot draw
+/// splats twice.
 fn is_drawn(index: u32, view: u32) -> bool {
     if !is_fine(index, view) {
         return false;
@@ -95,7 +96,7 @@ fn cull(
     }
 }
 
-// One workgroup: turns numbers of regions into first regions.
+// One workgroup: converts numbers of regions to first regions.
 @compute @workgroup_size(256)
 fn place(@builtin(local_invocation_index) thread: u32) {
     let total = tick.cameras * tick.blocks;

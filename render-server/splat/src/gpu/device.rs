@@ -1,7 +1,7 @@
-//! Which adapter renders, and the device on it.
+//! Selection of the adapter, and the device on it.
 //!
-//! Devices fail: drivers reset, cards are unplugged, memory runs out. Every error ends up in one
-//! place ([`Device::fault`]), asked after each tick; nothing panics.
+//! Devices fail: drivers reset, cards are unplugged, memory runs out. Every error is stored in one place
+//! ([`Device::fault`]), which is checked after each tick; nothing panics.
 
 #![allow(unsafe_code, reason = "shaders without counters in their loops, a tenth faster on a card")]
 
@@ -13,16 +13,16 @@ use std::task::{Context, Poll, Waker};
 
 use super::limits::Budget;
 
-/// What adapters are there, for reports.
+/// Name and kind of an adapter, for reports.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct AdapterName {
-    /// As the driver reports it: `NVIDIA GeForce RTX 3080 (Vulkan)`.
+    /// Name from the driver, with the interface: `NVIDIA GeForce RTX 3080 (Vulkan)`.
     pub name: String,
-    /// Whether it is the processor in disguise (llvmpipe, SwiftShader, WARP).
+    /// Whether it is a software renderer on the processor (llvmpipe, SwiftShader, WARP).
     pub is_software: bool,
 }
 
-/// An adapter that can render.
+/// Adapter that can render.
 #[derive(Debug)]
 pub struct Adapter {
     inner: wgpu::Adapter,
@@ -30,9 +30,10 @@ pub struct Adapter {
 }
 
 impl Adapter {
-    /// Returns all adapters that can render, the likely fastest first.
+    /// Returns all adapters that can render, the presumably fastest first.
     pub fn all() -> Vec<Self> {
-        // No check of indirect dispatches: their arguments are ours, and bounded by the buffers.
+        // No validation of indirect dispatches: their arguments are computed by this renderer's shaders, and limited
+        // by the buffers.
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
             flags: wgpu::InstanceFlags::empty(),
             ..wgpu::InstanceDescriptor::new_without_display_handle()
@@ -63,12 +64,12 @@ impl Adapter {
         adapters.into_iter().map(named).collect()
     }
 
-    /// Returns what it is.
+    /// Returns the name and kind of the adapter.
     pub fn name(&self) -> &AdapterName {
         &self.name
     }
 
-    /// Opens a device with the adapter's own limits on buffers.
+    /// Opens a device with the adapter's own limits for buffers.
     pub(super) fn open(&self, budget: &Budget) -> Result<Device, String> {
         let adapter = &self.inner;
         let best = adapter.limits();
@@ -90,7 +91,7 @@ impl Adapter {
         let fault = Arc::new(OnceLock::new());
         let uncaptured = Arc::clone(&fault);
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
-            // The first is the cause; later ones follow from it.
+            // The first error is the cause; later ones are its consequences.
             let _ = uncaptured.set(error.to_string());
         }));
         let lost = Arc::clone(&fault);
@@ -101,7 +102,7 @@ impl Adapter {
             .max_storage_buffer_binding_size
             .min(best.max_buffer_size)
             .min(budget.binding_bytes)
-            // Indices into words are 32 bits wide; a limit of 4 GiB less a page keeps them so.
+            // Indices into words are 32 bits wide, so a binding is limited to slightly less than 4 GiB.
             .min(MAX_BINDING_BYTES);
         Ok(Device {
             device,
@@ -115,28 +116,28 @@ impl Adapter {
     }
 }
 
-/// An open device and its limits.
+/// Open device and its limits.
 #[derive(Debug)]
 pub(super) struct Device {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
     fault: Arc<OnceLock<String>>,
-    /// Greatest size of a buffer that a shader sees.
+    /// Maximum size of a buffer that a shader accesses. [byte]
     pub(super) binding_bytes: u64,
     pub(super) has_timestamps: bool,
-    /// Whether it is no processor in disguise.
+    /// Whether it is a graphics card instead of a software renderer.
     pub(super) is_card: bool,
-    /// Whether shaders can write what the host reads.
+    /// Whether shaders can write to host memory.
     pub(super) maps_storage: bool,
 }
 
 impl Device {
-    /// Returns what went wrong first, if anything did: the device is of no more use then.
+    /// Returns the first error, if any; the device is then unusable.
     pub(super) fn fault(&self) -> Option<String> {
         self.fault.get().cloned()
     }
 
-    /// Creates a buffer of at least one element of whatever it holds.
+    /// Creates a buffer; its size is at least that of one element of any type.
     pub(super) fn buffer(
         &self,
         label: &str,
@@ -151,7 +152,7 @@ impl Device {
         })
     }
 
-    /// Creates a buffer that passes use among themselves.
+    /// Creates a buffer for data between passes.
     pub(super) fn storage(&self, label: &str, bytes: u64) -> wgpu::Buffer {
         self.buffer(label, bytes, wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST)
     }
@@ -170,7 +171,7 @@ impl Device {
         let descriptor = wgpu::ShaderModuleDescriptor { label: Some(entry), source };
         let mut checks = wgpu::ShaderRuntimeChecks::checked();
         checks.force_loop_bounding = false;
-        // SAFETY: what is left out is a counter in each loop that ends those that would not: all of ours end.
+        // SAFETY: only the counters are omitted that end infinite loops: all loops of these shaders end.
         let module = unsafe { self.device.create_shader_module_trusted(descriptor, checks) };
         let pipeline = self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(entry),
@@ -187,7 +188,7 @@ impl Device {
         Kernel { pipeline }
     }
 
-    /// Binds whole buffers for a kernel.
+    /// Binds complete buffers for a kernel.
     pub(super) fn bind(
         &self,
         kernel: &Kernel,
@@ -220,26 +221,26 @@ impl Device {
     }
 }
 
-/// Part of a buffer.
+/// Range of a buffer.
 pub(super) type Slice<'a> = wgpu::BufferSlice<'a>;
 
-/// A compiled entry point.
+/// Compiled entry point.
 #[derive(Debug)]
 pub(super) struct Kernel {
     pipeline: wgpu::ComputePipeline,
 }
 
-/// How many workgroups run.
+/// Number of workgroups.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Groups<'a> {
-    /// Known here: x, y.
+    /// Known on the host: x, y.
     Known(u32, u32),
-    /// Counted by the device: three words of a buffer, from this word on.
+    /// Counted on the device: three words of a buffer, from this index on.
     Counted(&'a wgpu::Buffer, u32),
 }
 
 impl Groups<'_> {
-    /// Returns one workgroup per tile; `GRID` of the shaders is how many lie along x at most.
+    /// Returns one workgroup per tile; `GRID` of the shaders is the maximum along x.
     pub(super) fn of_tiles(tiles: u32) -> Self {
         const GRID: u32 = 32_768;
         Self::Known(tiles.min(GRID), tiles.div_ceil(GRID))
@@ -247,7 +248,7 @@ impl Groups<'_> {
 }
 
 impl Kernel {
-    /// Adds a run to a pass.
+    /// Adds a dispatch to a pass.
     pub(super) fn run(
         &self,
         pass: &mut wgpu::ComputePass<'_>,
@@ -265,7 +266,7 @@ impl Kernel {
     }
 }
 
-/// Returns what a future of wgpu holds: off the web they are ready at once.
+/// Returns the output of a wgpu future; outside of browsers, these are ready at once.
 fn ready<F: Future>(future: F) -> F::Output {
     let mut future = pin!(future);
     let mut context = Context::from_waker(Waker::noop());
@@ -277,5 +278,5 @@ fn ready<F: Future>(future: F) -> F::Output {
     }
 }
 
-/// 4 GiB less 64 KiB.
+/// Maximum size of a binding: 4 GiB minus 64 KiB. [byte]
 const MAX_BINDING_BYTES: u64 = (1 << 32) - (1 << 16);

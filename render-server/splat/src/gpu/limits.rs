@@ -1,18 +1,18 @@
-//! What a renderer may use, and the size of a tile.
+//! Resource limits of a renderer, and the size of a tile.
 
 /// Side of a tile; `TILE` in `common.wgsl`. [px]
 pub(super) const TILE_PX: u32 = 16;
 
-/// What a renderer may use and starts with; the defaults suit every scene.
+/// Resource limits and initial sizes of a renderer; the defaults suit every scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
-    /// Greatest size of a buffer that shaders see; the adapter's own limit holds too.
+    /// Maximum size of a buffer that shaders access; the adapter's own limit also applies.
     pub binding_bytes: u64,
-    /// Regions of 256 slots to begin with; grown where an image needs more.
+    /// Initial number of regions of 256 slots; grows if an image needs more.
     pub regions: u32,
-    /// (Tile, splat) pairs to begin with; grown where an image needs more.
+    /// Initial number of (tile, splat) pairs; grows if an image needs more.
     pub pairs: u32,
-    /// Whether pixels are written to the host's memory, if the adapter can; else they are copied there.
+    /// Whether shaders write pixels directly to host memory, if the adapter supports it. Otherwise pixels are copied.
     pub writes_to_host: bool,
 }
 

@@ -1,21 +1,19 @@
-//! The renderer for graphics cards, through wgpu: Vulkan, Metal, Direct3D 12.
+//! Renderer for graphics cards, through wgpu: Vulkan, Metal, Direct3D 12.
 //!
-//! Data flow, the files in run order: `scene` packs and uploads once; `view` turns cameras and
-//! placements into numbers. Then, for all cameras of a tick in one submission: `cull` finds the
-//! blocks in view and gives each a region of slots, `project` brings their splats onto the image
-//! planes and counts those of each 16x16-pixel tile (`cover.wgsl`), `bin` gives each tile its list, `sort` puts
-//! that in order of depth, `blend` renders the tiles, `read` brings pixels home. `device` chooses the
-//! adapter; `buffers` is what passes share.
+//! Data flow, with the files in run order: `scene` packs and uploads once. `view` converts cameras and placements to
+//! numbers. Then, for all cameras of a tick in one submission: `cull` finds the blocks in view and assigns each a
+//! region of slots. `project` projects their splats onto the image planes and counts those of each 16x16-pixel tile
+//! (`cover.wgsl`). `bin` builds the list of each tile, `sort` sorts it by depth, `blend` renders the tiles, and
+//! `read` copies pixels to the host. `device` selects the adapter; `buffers` contains the shared buffers.
 //!
-//! Nothing is read back in mid-frame: the device counts and dispatches on its own. What it counted
-//! comes back with the images; had it too little room, buffers grow and the tick is rendered again, so
-//! that no image ever lacks a splat. No kernel uses subgroup operations or waits for another
-//! workgroup. Slots of regions are in order of the scene, and lists are sorted by depth and slot: the same
-//! tick gives the same images, bit for bit, on any adapter that rounds alike.
+//! Nothing is read back within a tick: the device counts and dispatches by itself. The counts are read with the
+//! images. If there was too little room, buffers grow and the tick is rendered again, so that no image lacks a splat.
+//! No kernel uses subgroup operations or waits for another workgroup. Slots of regions are in scene order, and lists
+//! are sorted by depth and slot: the same tick gives bit-identical images on all adapters with the same rounding.
 //!
-//! Memory: the formulas of `scene` and `buffers`.
+//! Memory: see the formulas in `scene` and `buffers`.
 //!
-//! A dispatch costs a card some 6 us beside its work: seven of them render a tick.
+//! A dispatch has an overhead of about 6 us on a card; a tick takes seven of them.
 
 mod bin;
 mod blend;
@@ -49,16 +47,17 @@ use vizflyt_protocol::geometry::Intrinsics;
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
 use crate::{Camera, CpuRenderer, Placement, RgbdImage, Scene};
 
-/// Ticks that may be under way at once.
+/// Maximum number of ticks in flight.
 const MAX_IN_FLIGHT: usize = 2;
-/// Cameras of a tick: what `Cover` of `cover.wgsl` has bits for; as for tiles along an image's side.
+/// Maximum number of cameras per tick: `Cover` of `cover.wgsl` has a fixed number of bits for them, and for the tiles
+/// along an image's side.
 const MAX_CAMERAS: usize = 1 << 12;
 const _: () = assert!(Intrinsics::MAX_SIDE_PX.div_ceil(TILE_PX) < 1 << 10);
 
-/// Renders a scene with a graphics card.
+/// Renderer that uses a graphics card.
 #[derive(Debug)]
 pub struct GpuRenderer {
-    /// The adapter's.
+    /// Name of the adapter.
     name: String,
     device: Device,
     passes: Passes,
@@ -67,16 +66,16 @@ pub struct GpuRenderer {
     limit: Capacity,
     bound: Option<Bound>,
     spare: Vec<Staging>,
-    /// Ticks under way.
+    /// Ticks in flight.
     in_flight: VecDeque<(PendingTick, wgpu::SubmissionIndex)>,
     lenses: view::Lenses,
-    /// Cameras rendered in one submission at most; fewer once they have not fitted.
+    /// Maximum number of cameras per submission; reduced when a submission does not fit.
     together: usize,
     budget: Budget,
     workload: Workload,
 }
 
-/// The kernels.
+/// Compiled kernels.
 #[derive(Debug)]
 struct Passes {
     cull: cull::Cull,
@@ -86,7 +85,7 @@ struct Passes {
     blend: blend::Blend,
 }
 
-/// Buffers, and the kernels' bindings to them.
+/// Buffers and the kernels' bindings to them.
 #[derive(Debug)]
 struct Bound {
     buffers: Buffers,
@@ -95,17 +94,17 @@ struct Bound {
     bin: bin::BinBindings,
     sort: wgpu::BindGroup,
     blend: wgpu::BindGroup,
-    /// What it writes to where shaders cannot write what the host reads.
+    /// Output of `blend`, if shaders cannot write to host memory.
     output: Option<blend::Output>,
 }
 
-/// A tick to be rendered.
+/// Tick to be rendered.
 #[derive(Debug)]
 struct PendingTick {
     placements: Vec<Placement>,
     cameras: Vec<Camera>,
     places: Vec<ImageOffset>,
-    /// `tiles` and `pixels` are exact.
+    /// Required capacity; `tiles` and `pixels` are exact.
     wanted: Capacity,
     staging: Staging,
     began: Instant,
@@ -113,17 +112,16 @@ struct PendingTick {
 
 /// Why a tick cannot be rendered.
 enum SubmitError {
-    /// It needs larger buffers than the device has; fewer cameras at once may fit.
+    /// Larger buffers are needed than the device has; fewer cameras at once may fit.
     TooLarge(String),
     Render(RenderError),
 }
 
 impl GpuRenderer {
-    /// Uploads a scene to a device on `adapter`. Splats that no image would show are left out.
+    /// Uploads a scene to a device on `adapter`. Omits splats that no image would show.
     ///
     /// # Errors
-    /// [`RenderError::Device`] with the driver's message, if the device does not open or has no
-    /// room.
+    /// [`RenderError::Device`] with the driver's message, if the device does not open or has too little memory.
     pub fn new<'a>(
         scene: impl Into<Scene<'a>>,
         adapter: &Adapter,
@@ -132,10 +130,10 @@ impl GpuRenderer {
         Self::like(&CpuRenderer::new(scene), adapter, budget)
     }
 
-    /// Uploads what a processor's renderer has packed, to render it in the same detail.
+    /// Uploads the packed scene of a CPU renderer, and renders it in the same detail.
     ///
     /// # Errors
-    /// As [`Self::new`]; and of a scene larger than memory.
+    /// Same as [`Self::new`], and if the scene is larger than memory.
     pub fn like(
         packed: &CpuRenderer,
         adapter: &Adapter,
@@ -171,29 +169,29 @@ impl GpuRenderer {
         })
     }
 
-    /// Renders another scene from now on, in the detail in which it is packed.
+    /// Replaces the scene, and uses the detail in which the new one is packed.
     ///
     /// # Errors
-    /// As [`Self::like`]; this renderer is of no more use then.
+    /// Same as [`Self::like`]; the renderer is then unusable.
     ///
     /// # Panics
-    /// If a tick is under way.
+    /// If a tick is in flight.
     pub fn load(&mut self, packed: &CpuRenderer) -> Result<(), RenderError> {
-        assert!(self.in_flight.is_empty(), "finish what was begun first");
+        assert!(self.in_flight.is_empty(), "finish the ticks in flight first");
         self.bound = None;
         self.scene = upload(&self.device, packed)?;
         self.workload = Workload { splats: self.scene.len, ..Workload::default() };
         self.check_device().map_err(SubmitError::into_error)
     }
 
-    /// Starts to render one image per camera and returns at once; [`Self::finish`] fetches them. Two
-    /// ticks may be under way.
+    /// Starts to render one image per camera and returns at once; [`Self::finish`] fetches the images. Two ticks may
+    /// be in flight.
     ///
     /// # Errors
-    /// [`RenderError`], as [`Rasterizer::render`].
+    /// [`RenderError`], as in [`Rasterizer::render`].
     ///
     /// # Panics
-    /// If two ticks are under way, or there are not as many placements as objects.
+    /// If two ticks are in flight, or the number of placements differs from that of the objects.
     pub fn begin(
         &mut self,
         placements: &[Placement],
@@ -204,19 +202,19 @@ impl GpuRenderer {
         self.submit_tick(placements, cameras).map_err(SubmitError::into_error)
     }
 
-    /// Waits for the tick that was begun first, fills its images, and returns how long the passes
-    /// took on the device; `total_ms` counts from [`Self::begin`].
+    /// Waits for the oldest tick in flight, fills its images, and returns the time of the passes on the device.
+    /// `total_ms` starts at [`Self::begin`].
     ///
     /// # Errors
-    /// [`RenderError::Device`]; the tick is dropped then.
+    /// [`RenderError::Device`]; the tick is then dropped.
     ///
     /// # Panics
-    /// If no tick is under way, or there are not as many images as it has cameras.
+    /// If no tick is in flight, or the number of images differs from that of its cameras.
     pub fn finish(&mut self, images: &mut [RgbdImage]) -> Result<PassTimes, RenderError> {
         self.finish_tick(images).map_err(SubmitError::into_error)
     }
 
-    /// Destroys the device, as a driver's reset does: to test what takes over.
+    /// Destroys the device, like a driver reset: for tests of the fallback.
     pub fn lose_device(&self) {
         self.device.device.destroy();
     }
@@ -227,7 +225,7 @@ impl GpuRenderer {
         placements: &[Placement],
         cameras: &[Camera],
     ) -> Result<(), SubmitError> {
-        assert!(self.in_flight.len() < MAX_IN_FLIGHT, "two ticks are under way already");
+        assert!(self.in_flight.len() < MAX_IN_FLIGHT, "two ticks are already in flight");
         let began = Instant::now();
         if cameras.len() > MAX_CAMERAS {
             return Err(SubmitError::TooLarge(format!("{} cameras at once", cameras.len())));
@@ -269,7 +267,7 @@ impl GpuRenderer {
         self.scene.ids.len() > 1
     }
 
-    /// Makes sure of buffers for what is wanted.
+    /// Grows the buffers if the capacity is insufficient.
     fn reserve(&mut self, wanted: &Capacity) -> Result<(), SubmitError> {
         if !wanted.is_within(&self.limit) {
             return Err(SubmitError::TooLarge(format!(
@@ -281,7 +279,7 @@ impl GpuRenderer {
         if self.bound.is_some() && has.holds(wanted) {
             return Ok(());
         }
-        // The old buffers go first: the new ones may need their memory.
+        // The old buffers are dropped first: the new ones may need their memory.
         self.bound = None;
         let capacity = has.grown_to(wanted, &self.limit);
         let buffers = Buffers::new(&self.device, capacity, self.has_ids());
@@ -308,7 +306,7 @@ impl GpuRenderer {
         }
     }
 
-    /// Writes a tick's numbers and submits its passes and copies.
+    /// Writes the inputs of a tick and submits its passes and copies.
     fn submit(&mut self, pending: &PendingTick) -> wgpu::SubmissionIndex {
         let tiles = pending.wanted.tiles as u32;
         let views = self.views(pending);
@@ -366,7 +364,7 @@ impl GpuRenderer {
         submission
     }
 
-    /// Returns the cameras as each part sees them.
+    /// Returns the cameras as seen from each part.
     fn views(&mut self, pending: &PendingTick) -> Vec<GpuView> {
         let mut views = Vec::with_capacity(pending.cameras.len() * self.scene.ids.len());
         for (camera, &place) in pending.cameras.iter().zip(&pending.places) {
@@ -383,7 +381,7 @@ impl GpuRenderer {
             for (placement, (&id, &antialiased)) in pending.placements.iter().zip(parts) {
                 views.push(match placement {
                     Some(world_from_object) => {
-                        // An object that moves is one that stands still before a moving camera.
+                        // A moving object before a camera is the same as a static object before a moving camera.
                         let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
                         GpuView::new(camera, &lens, &object_from_cam, place, id, antialiased)
                     }
@@ -394,10 +392,10 @@ impl GpuRenderer {
         views
     }
 
-    /// Waits for the first tick under way; renders it again where it had too little room.
+    /// Waits for the oldest tick in flight; renders it again if it had too little room.
     fn finish_tick(&mut self, images: &mut [RgbdImage]) -> Result<PassTimes, SubmitError> {
         let (mut pending, mut submission) =
-            self.in_flight.pop_front().expect("a tick is under way");
+            self.in_flight.pop_front().expect("a tick is in flight");
         assert_eq!(pending.cameras.len(), images.len(), "one image per camera");
         let has_ids = self.has_ids();
         loop {
@@ -449,7 +447,7 @@ fn upload(device: &Device, packed: &CpuRenderer) -> Result<GpuScene, RenderError
 impl SubmitError {
     fn into_error(self) -> RenderError {
         match self {
-            // Another renderer must do it, as if this one were gone.
+            // Another renderer must render it, as if this device were lost.
             Self::TooLarge(why) => RenderError::Device(why),
             Self::Render(error) => error,
         }
@@ -457,7 +455,8 @@ impl SubmitError {
 }
 
 impl Rasterizer for GpuRenderer {
-    /// Returns `gpu`, the adapter's name and the interface, and whether it is in adaptive detail: `gpu llvmpipe (Vulkan)`.
+    /// Returns `gpu`, the name of the adapter with its interface, and whether the detail is adaptive:
+    /// `gpu llvmpipe (Vulkan)`.
     fn name(&self) -> Cow<'_, str> {
         let detail = if self.scene.max_error_px > 0.0 { ", adaptive detail" } else { "" };
         format!("gpu {}{detail}", self.name).into()
@@ -470,7 +469,7 @@ impl Rasterizer for GpuRenderer {
         images: &mut [RgbdImage],
     ) -> Result<PassTimes, RenderError> {
         rasterizer::validate(self.scene.ids.len() - 1, placements, cameras, images)?;
-        assert!(self.in_flight.is_empty(), "finish what was begun first");
+        assert!(self.in_flight.is_empty(), "finish the ticks in flight first");
         let start = Instant::now();
         let mut times = PassTimes::default();
         let mut done = 0;

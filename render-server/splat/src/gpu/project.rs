@@ -1,10 +1,10 @@
-//! Pass 2: the splats of visible blocks onto the image plane.
+//! Pass 2: projects the splats of visible blocks onto the image plane.
 //!
-//! Also which tiles each touches, and how many each tile has.
+//! It also finds the tiles that each splat touches, and counts the splats of each tile.
 //!
-//! Budget: 52 bytes read per splat of a visible block, 2 per number of its harmonics where it is
-//! seen; 16 bytes written per slot and 48 per survivor, an atomic per pair. At 1 TB/s: 0.1 ms per million visible splats
-//! without harmonics, 0.2 ms with those of degree 3.
+//! Budget: 52 bytes read per splat of a visible block, and 2 per value of its harmonics if it is visible; 16 bytes
+//! written per slot and 48 per survivor, and an atomic per pair. At 1 TB/s: 0.1 ms per million visible splats without
+//! harmonics, 0.2 ms with those of degree 3.
 
 use super::buffers::Buffers;
 use super::device::{Device, Groups, Kernel};
@@ -18,7 +18,7 @@ const SOURCE: &str = concat!(
     include_str!("project.wgsl")
 );
 
-/// The pass.
+/// Pass with its kernel.
 #[derive(Debug)]
 pub(super) struct Project {
     kernel: Kernel,

@@ -1,10 +1,10 @@
-// Pass 2: the splats of visible blocks onto the image plane. See `cpu/project.rs` for the form in
-// which a projected Gaussian is kept, and why it is stable.
+// Pass 2: projects the splats of visible blocks onto the image plane. See `cpu/project.rs` for the form of a
+// projected Gaussian, and why it is stable.
 
 struct Chunk {
-    /// The chunk's first block.
+    /// First block of the chunk.
     first_block: u32,
-    /// Words from block to block of `geometry`.
+    /// Number of words from block to block of `geometry`.
     stride: u32,
     padding: vec2<u32>,
 }
@@ -13,10 +13,10 @@ struct Chunk {
 @group(0) @binding(1) var<storage, read> views: array<View>;
 @group(0) @binding(2) var<storage, read> regions: array<u32>;
 @group(0) @binding(3) var<uniform> chunk: Chunk;
-// Per block: part, first word of its harmonics, coefficients per channel, splats; then 13 columns
-// of BLOCK numbers: centre, axes times scales, log2 of the opacity.
+// Per block: part, first word of its harmonics, coefficients per channel, splats; then 13 columns of BLOCK values:
+// centre, axes times scales, log2 of the opacity.
 @group(0) @binding(4) var<storage, read> geometry: array<u32>;
-// Halves, two to a word: per block, coefficient by coefficient, RGB within, BLOCK of each.
+// Halves, two per word: per block, coefficient by coefficient, in each RGB, BLOCK of each.
 @group(0) @binding(5) var<storage, read> harmonics: array<u32>;
 @group(0) @binding(6) var<storage, read_write> projected: array<Projected>;
 @group(0) @binding(7) var<storage, read_write> covers: array<Cover>;
@@ -25,13 +25,13 @@ struct Chunk {
 
 const HEADER = 4u;
 const BLUR = 0.3;
-/// Half of log2(e): sigma's 1/2, for powers of two.
+/// Half of log2(e): the factor 1/2 of sigma, for powers of two.
 const HALF_LOG2_E = 0.72134752;
 /// Extent^2 of the ellipse per level and variance: 2 ln 2.
 const EXTENT2 = 1.3862944;
-/// No splat is wider; guards f32 against overflow. [px]
+/// Maximum extent of a splat; prevents overflow of f32. [px]
 const MAX_EXTENT = 1e18;
-/// Further from the camera, squares leave f32. [m]
+/// Maximum distance from the camera; beyond it, squares exceed f32. [m]
 const MAX_DISTANCE = 1e18;
 
 const NO_LENS = 0u;
@@ -49,13 +49,13 @@ fn vector(first: u32, column: u32, lane: u32) -> vec3<f32> {
     );
 }
 
-/// Arc tangent of a number that is not negative, to f32's rounding; drivers' own may be off by 1e-3.
+/// Returns the arc tangent of a non-negative number, to the rounding of f32. That of drivers may be off by 1e-3.
 fn arc_tangent(r: f32) -> f32 {
-    // atan r = pi/2 - atan 1/r, and atan x = 2 atan(x / (1 + sqrt(1 + x^2))): to |x| < 0.42.
+    // atan r = pi/2 - atan 1/r, and atan x = 2 atan(x / (1 + sqrt(1 + x^2))): reduces to |x| < 0.42.
     let x = select(r, 1.0 / r, r > 1.0);
     let y = x / (1.0 + sqrt(1.0 + x * x));
     let yy = y * y;
-    // The series of atan; its next term is below 3e-8.
+    // Series of atan; its next term is below 3e-8.
     var sum = 1.0 / 17.0;
     sum = 1.0 / 15.0 - yy * sum;
     sum = 1.0 / 13.0 - yy * sum;
@@ -70,12 +70,12 @@ fn arc_tangent(r: f32) -> f32 {
 
 struct Distorted {
     slope: vec2<f32>,
-    /// How it changes with the slope, column by column.
+    /// Derivative by the slope, column by column.
     along_x: vec2<f32>,
     along_y: vec2<f32>,
 }
 
-/// As `vizflyt_protocol::geometry::Distortion::distort`.
+/// Same as `vizflyt_protocol::geometry::Distortion::distort`.
 fn distort(view: u32, slope: vec2<f32>) -> Distorted {
     let model = views[view].flags.x;
     let k = views[view].lens;
@@ -104,7 +104,7 @@ fn distort(view: u32, slope: vec2<f32>) -> Distorted {
     }
     let r = sqrt(rr);
     if r < 1e-4 {
-        // What is left out is below 1e-8 of the slope.
+        // The omitted terms are below 1e-8 of the slope.
         return Distorted(slope, vec2(1.0, 0.0), vec2(0.0, 1.0));
     }
     let t = arc_tangent(r);
@@ -135,7 +135,7 @@ fn coefficient(first: u32, k: u32, lane: u32) -> vec3<f32> {
     );
 }
 
-/// As `harmonics::colour`.
+/// Same as `harmonics::colour`.
 fn colour(first: u32, coefficients: u32, lane: u32, direction: vec3<f32>) -> vec3<f32> {
     let x = direction.x;
     let y = direction.y;
@@ -168,7 +168,7 @@ fn colour(first: u32, coefficients: u32, lane: u32, direction: vec3<f32>) -> vec
     return max(rgb, vec3(0.0));
 }
 
-/// Returns which tiles of an image an ellipse touches.
+/// Returns the tiles of an image that an ellipse touches.
 fn cover_of(e: Ellipse, view: u32, key: u32, camera: u32) -> Cover {
     let size = views[view].size;
     let extent_y = sqrt(e.reach / e.falloff.y);
@@ -193,7 +193,7 @@ fn cover_of(e: Ellipse, view: u32, key: u32, camera: u32) -> Cover {
         let reached = band(e, f32(top) + 0.5, f32(bottom) - 0.5);
         let pixels = centres(reached.x, reached.y, f32(size.x));
         if pixels.x < pixels.y {
-            // Rounding may find a row wider than the whole.
+            // Rounding may give a row that is wider than the whole ellipse.
             let from_column = (max(pixels.x / TILE, first.x) - first.x) / cell.x;
             let to_column = (min((pixels.y - 1u) / TILE, first.x + tiles.x - 1u) - first.x) / cell.x;
             let bits = (2u << to_column) - (1u << from_column);
@@ -203,12 +203,12 @@ fn cover_of(e: Ellipse, view: u32, key: u32, camera: u32) -> Cover {
     return cover;
 }
 
-/// Projects one splat into a slot; returns what it touches.
+/// Projects one splat into a slot; returns the tiles that it touches.
 fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> Cover {
     if lane >= geometry[first + 3u] {
         return nothing();
     }
-    // Relative to the camera before anything else: large coordinates cancel while still exact.
+    // Subtracts the camera's position first: large coordinates cancel while they are exact.
     let d = vector(first, 0u, lane) - vec3(views[view].row_x.w, views[view].row_y.w, views[view].row_z.w);
     let z = dot(views[view].row_z.xyz, d);
     let farthest = max(max(abs(d.x), abs(d.y)), abs(d.z));
@@ -249,13 +249,13 @@ fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> Co
 
     var level = number(first, 12u, lane);
     if views[view].more.w != 0.0 {
-        // Dimmed by what the blur adds to its area; not at all where that is beyond f32.
+        // Dimmed by the area that the blur adds; not if the determinant exceeds f32.
         let ratio = select(1.0, sharp / determinant, determinant < 1e36);
         level += 0.5 * log2(max(ratio, 1e-30));
     }
     let reach2 = (level - MIN_LEVEL) * EXTENT2;
     let extent = sqrt(reach2 * vec2(a, c));
-    // Whether some pixel centre is within the ellipse's box.
+    // Tests whether the ellipse's box contains a pixel centre.
     let size = vec2<f32>(views[view].size.xy);
     let is_seen = reach2 >= 0.0
         && all(mean + extent > vec2(0.5))
@@ -264,11 +264,11 @@ fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> Co
     if !is_seen {
         return nothing();
     }
-    // Above 0, so that dividing by it is no trap where a splat covers everything evenly.
+    // Above 0, so that division by it is safe if a splat covers everything evenly.
     let falloff = max(HALF_LOG2_E * vec2(c / determinant, 1.0 / c), vec2(1e-36));
     let distance = sqrt(dot(d, d));
     let rgb = colour(geometry[first + 1u], geometry[first + 2u], lane, d / distance);
-    // As `Atmosphere::attenuate`.
+    // Same as `Atmosphere::attenuate`.
     let light = views[view].light;
     let fog = views[view].fog.xyz;
     let seen = mix(fog, rgb * light.xyz, exp2(-light.w * distance));
@@ -283,7 +283,7 @@ fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> Co
     return cover_of(ellipse, view, bitcast<u32>(z), camera);
 }
 
-/// The region of a block that its camera sees; NO_REGION for another.
+/// Region of a block that its camera sees; otherwise NO_REGION.
 var<workgroup> own_region: u32;
 
 const NO_REGION = 0xffffffffu;

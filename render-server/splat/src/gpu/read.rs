@@ -1,11 +1,11 @@
-//! From the device's memory to the images.
+//! Copies images from the device's memory to the host.
 //!
-//! Each tick has one of two staging buffers: while one tick is read here, the next is rendered there. Where
-//! the adapter lets shaders write what the host reads, `blend` writes the pixels there itself, across the bus
-//! while it still computes; elsewhere they are copied.
+//! Each tick uses one of two staging buffers: while one tick is read on the host, the next is rendered on the device.
+//! If the adapter lets shaders write to host memory, `blend` writes the pixels there itself, across the bus while it
+//! still computes; otherwise they are copied.
 //!
-//! Budget: 16 bytes per pixel over the bus (20 with ids): 4.9 MB at 640x480, 0.2 ms at 25 GB/s; then
-//! 28 bytes written per pixel, by all cores.
+//! Budget: 16 bytes per pixel over the bus (20 with ids): 4.9 MB at 640x480, 0.2 ms at 25 GB/s. Then 28 bytes written
+//! per pixel, by all cores.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,17 +21,17 @@ use super::view::ImageOffset;
 use crate::blocks::BLOCK;
 use crate::{Camera, RgbdImage};
 
-/// Passes with timestamps.
+/// Number of passes with timestamps.
 pub(super) const PASSES: usize = 5;
-/// Where the timestamps lie in a staging buffer.
+/// Offset of the timestamps in a staging buffer.
 const STAMPS_AT: u64 = SIZES_BYTES;
-/// Where the pixels do; a multiple of every adapter's alignment of bindings.
+/// Offset of the pixels; a multiple of the binding alignment of every adapter.
 const PIXELS_AT: u64 = 256;
 /// `pixels` of `blend.wgsl`.
 type Pixel = [u32; 4];
 const PIXEL_BYTES: u64 = size_of::<Pixel>() as u64;
 
-/// Returns where the ids of so many pixels lie in a staging buffer.
+/// Returns the offset of the ids in a staging buffer for `pixels` pixels.
 fn ids_at(pixels: u64) -> u64 {
     (PIXELS_AT + pixels * PIXEL_BYTES).next_multiple_of(PIXELS_AT)
 }
@@ -51,24 +51,24 @@ pub(super) struct Sizes {
 const _: () = assert!(size_of::<Sizes>() as u64 == SIZES_BYTES);
 
 impl Sizes {
-    /// Whether there was room for everything.
+    /// Returns whether there was room for everything.
     pub(super) fn is_complete(&self) -> bool {
         u64::from(self.regions_wanted) * BLOCK as u64 == u64::from(self.slots)
             && self.pairs_wanted == self.pairs
     }
 }
 
-/// Timestamps of passes: begin and end each.
+/// Timestamps of passes: start and end of each.
 #[derive(Debug)]
 pub(super) struct Stamps {
     pub(super) queries: wgpu::QuerySet,
     resolved: wgpu::Buffer,
-    /// [ms]
+    /// Period of a timestamp's tick. [ms]
     period_ms: f64,
 }
 
 impl Stamps {
-    /// Is `None` where the adapter has no clock.
+    /// Returns `None` if the adapter has no timestamps.
     pub(super) fn new(device: &Device) -> Option<Self> {
         device.has_timestamps.then(|| Self {
             queries: device.device.create_query_set(&wgpu::QuerySetDescriptor {
@@ -85,7 +85,7 @@ impl Stamps {
         })
     }
 
-    /// Returns the two stamps of a pass.
+    /// Returns the two timestamps of a pass.
     pub(super) fn of_pass(&self, pass: usize) -> wgpu::ComputePassTimestampWrites<'_> {
         wgpu::ComputePassTimestampWrites {
             query_set: &self.queries,
@@ -95,18 +95,18 @@ impl Stamps {
     }
 }
 
-/// A buffer that the host can read.
+/// Buffer that the host can read.
 #[derive(Debug)]
 pub(super) struct Staging {
     buffer: wgpu::Buffer,
-    /// Whether the host sees it.
+    /// Whether the buffer is mapped.
     is_mapped: Arc<AtomicBool>,
-    /// It as the output of `blend`, where shaders can write it, and of how many pixels.
+    /// Binding of this buffer as output of `blend`, if shaders can write to it, and its number of pixels.
     output: Option<(Output, u64)>,
 }
 
 impl Staging {
-    /// Returns one for so many pixels; a given one if it is large enough.
+    /// Returns a buffer for `pixels` pixels; reuses `old` if it is large enough.
     pub(super) fn for_pixels(
         old: Option<Self>,
         device: &Device,
@@ -114,7 +114,7 @@ impl Staging {
         pixels: u64,
         has_ids: bool,
     ) -> Self {
-        // A binding is never empty.
+        // A binding must not be empty.
         let ids = if has_ids { pixels * 4 } else { PIXELS_AT };
         let mut staging = Self::of(old, device, ids_at(pixels) + ids);
         let is_bound = staging.output.as_ref().is_some_and(|&(_, bound)| bound == pixels);
@@ -127,12 +127,12 @@ impl Staging {
         staging
     }
 
-    /// Returns what `blend` writes to, if it is this.
+    /// Returns this buffer as output of `blend`, if shaders can write to it.
     pub(super) fn output(&self) -> Option<&Output> {
         self.output.as_ref().map(|(output, _)| output)
     }
 
-    /// Returns one of so many bytes; a given one if it is large enough.
+    /// Returns a buffer of at least `bytes` bytes; reuses `old` if it is large enough.
     pub(super) fn of(old: Option<Self>, device: &Device, bytes: u64) -> Self {
         old.filter(|old| old.buffer.size() >= bytes).unwrap_or_else(|| {
             let mut usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
@@ -144,7 +144,7 @@ impl Staging {
         })
     }
 
-    /// Adds the copy of the first bytes of a buffer.
+    /// Adds a copy of the first bytes of a buffer.
     pub(super) fn copy_from(
         &self,
         encoder: &mut wgpu::CommandEncoder,
@@ -155,7 +155,7 @@ impl Staging {
         encoder.copy_buffer_to_buffer(from, 0, &self.buffer, at, bytes);
     }
 
-    /// Adds the copies of a tick of so many pixels.
+    /// Adds the copies of a tick of `pixels` pixels.
     pub(super) fn copy(
         &self,
         encoder: &mut wgpu::CommandEncoder,
@@ -181,24 +181,24 @@ impl Staging {
         }
     }
 
-    /// Asks for the host's view; [`Self::read`] waits for it.
+    /// Starts mapping for the host; [`Self::read`] waits for it.
     pub(super) fn map(&self) {
         let is_mapped = Arc::clone(&self.is_mapped);
         is_mapped.store(false, Ordering::Relaxed);
-        // Whether it worked is determined by what follows: no view without it.
+        // The result is checked later: an unmapped buffer has no view.
         self.buffer.map_async(wgpu::MapMode::Read, .., move |_| {
             is_mapped.store(true, Ordering::Release);
         });
     }
 
-    /// Waits until the submission is done, and gives its bytes to `take`.
+    /// Waits for the submission, and passes its bytes to `take`.
     pub(super) fn read<R>(
         &self,
         device: &Device,
         submission: wgpu::SubmissionIndex,
         take: impl FnOnce(&[u8]) -> R,
     ) -> Result<R, String> {
-        // Being woken takes a tenth of a millisecond: a card that is nearly done is waited for awake.
+        // Waking up takes a tenth of a millisecond, so a card that is almost done is polled.
         let start = Instant::now();
         while device.is_card && start.elapsed() < AWAKE && !self.is_mapped.load(Ordering::Acquire) {
             if device.device.poll(wgpu::PollType::Poll).is_err() {
@@ -224,12 +224,12 @@ impl Staging {
     }
 }
 
-/// How long a processor is kept busy with waiting, per tick.
+/// Maximum time of polling per tick.
 const AWAKE: Duration = Duration::from_millis(1);
-/// An image that takes longer will not come: drivers give up after 2 to 10 s themselves. [s]
+/// Maximum time for an image; drivers give up after 2 to 10 s themselves. [s]
 const TIMEOUT_S: u64 = 60;
 
-/// Returns what the device counted, and ms of each pass where it has a clock.
+/// Returns the counts of the device, and the time of each pass [ms]; 0 without timestamps.
 pub(super) fn sizes(bytes: &[u8], stamps: Option<&Stamps>) -> (Sizes, [f32; PASSES]) {
     let (sizes, _) = Sizes::read_from_prefix(bytes).expect("staging holds the sizes");
     let mut times_ms = [0.0; PASSES];
@@ -239,14 +239,14 @@ pub(super) fn sizes(bytes: &[u8], stamps: Option<&Stamps>) -> (Sizes, [f32; PASS
             let stamp = |at: usize| {
                 bytes[at..at + 8].iter().rev().fold(0u64, |sum, &b| sum << 8 | u64::from(b))
             };
-            // Clocks may be reset in between.
+            // The clock may be reset in between.
             *ms = (stamp(at + 8).saturating_sub(stamp(at)) as f64 * stamps.period_ms) as f32;
         }
     }
     (sizes, times_ms)
 }
 
-/// Unpacks the images of a tick; `pixels` in all.
+/// Unpacks the images of a tick; `pixels` is their total number of pixels.
 pub(super) fn images(
     bytes: &[u8],
     cameras: &[Camera],
@@ -278,7 +278,7 @@ pub(super) fn images(
     }
 }
 
-/// Pixels that one task unpacks: some 10 us of work.
+/// Pixels per task: about 10 us of work.
 const BAND: usize = 4 * 1024;
 
 fn unpack(pixels: &[Pixel], image: &mut RgbdImage) {
@@ -303,10 +303,10 @@ fn unpack(pixels: &[Pixel], image: &mut RgbdImage) {
         });
 }
 
-/// Returns the number that the lower 16 bits hold as a half; it is finite. In a line of code that compilers make
-/// vectors of, where a conversion of the processor's would have to be asked for.
+/// Converts the half in the lower 16 bits to single precision; it must be finite. Written in plain arithmetic, so
+/// that compilers vectorise it; the processor's conversion would need a target feature.
 fn half_to_f32(bits: u32) -> f32 {
-    // Exponents of halves are 112 less: a product puts them right, subnormal ones too.
+    // The exponent bias of halves is 112 less: a product corrects it, also for subnormal numbers.
     let magnitude = f32::from_bits((bits & 0x7fff) << 13) * f32::from_bits(0x7780_0000);
     f32::from_bits(magnitude.to_bits() | (bits & 0x8000) << 16)
 }
@@ -316,7 +316,7 @@ mod tests {
     use half::f16;
 
     #[test]
-    fn every_finite_half_is_read() {
+    fn converts_every_finite_half() {
         let finite = (0..=u16::MAX).filter(|&bits| f16::from_bits(bits).is_finite());
         for bits in finite {
             let expected = f16::from_bits(bits).to_f32().to_bits();

@@ -1,6 +1,6 @@
-// Exclusive prefix sum over the 256 threads of a workgroup, in workgroup memory alone: no subgroup
-// operation, so it is right for subgroups of any size and for none. Sixteen runs of sixteen, for
-// barriers cost more than short loops: three of them instead of seventeen.
+// Exclusive prefix sum over the 256 threads of a workgroup, in workgroup memory only: no subgroup operations, so it
+// is correct for any subgroup size and without subgroups. Sixteen runs of sixteen, because barriers cost more than
+// short loops: three barriers instead of seventeen.
 
 const RUN = 16u;
 
@@ -29,7 +29,7 @@ fn scan(thread: u32, value: u32) -> u32 {
     if thread == 255u {
         scan_total = before + value;
     }
-    // Also keeps the next call from writing over what slower threads still read.
+    // Also prevents the next call from overwriting values that slower threads still read.
     workgroupBarrier();
     return before;
 }

@@ -1,11 +1,11 @@
-//! Uploads what the processor's renderer has packed ([`crate::cpu`]'s `scene`), once; then it is only read.
+//! Uploads the packed scene of the CPU renderer (`scene` of [`crate::cpu`]) once; it is read-only afterwards.
 //!
-//! The same blocks, and the coarser ones that stand for them where those are asked for; here column after column: the
-//! threads of a workgroup read neighbouring words. Blocks of all parts (what stands still, then the objects) lie one after
-//! the other in chunks, each of which a binding can hold.
+//! Contains the same blocks, and their coarser levels in adaptive detail, but stored column by column, so that the
+//! threads of a workgroup read neighbouring words. The blocks of all parts (the static part, then the objects) are
+//! stored one after the other in chunks, each of which fits a binding.
 //!
-//! Memory on the device: 52 bytes per splat and 6, 24, 54 or 96 for its harmonics as f16, a third more with coarser blocks:
-//! 740 MB for 5 M splats of degree 3, in full detail.
+//! Memory on the device: 52 bytes per splat, and 6, 24, 54 or 96 for its harmonics as f16, plus a third with coarser
+//! blocks. 5 M splats of degree 3 take 740 MB in full detail.
 
 use rayon::prelude::*;
 use zerocopy::{Immutable, IntoBytes};
@@ -16,31 +16,31 @@ use crate::blocks::BLOCK;
 use crate::cpu::detail::BRANCH;
 use crate::cpu::scene::{Block, GROUP, GROUP_NUMBERS, Part, column};
 
-/// Words before a block's columns; `HEADER` in `project.wgsl`.
+/// Number of words before a block's columns; `HEADER` in `project.wgsl`.
 const HEADER: usize = 4;
-/// Words from block to block.
+/// Number of words from block to block.
 const STRIDE: usize = HEADER + column::COUNT * BLOCK;
-/// Blocks that one dispatch can cover.
+/// Maximum number of blocks per dispatch.
 const MAX_BLOCKS: usize = 65_535;
 
-/// The scene on the device.
+/// Scene on the device.
 #[derive(Debug)]
 pub(super) struct GpuScene {
     /// [`Bounds`] of all blocks.
     pub(super) blocks: wgpu::Buffer,
     pub(super) chunks: Vec<Chunk>,
     pub(super) block_count: u32,
-    /// Ids of the parts: what stands still, then the objects.
+    /// Ids of the parts: static part, then the objects.
     pub(super) ids: Vec<u16>,
     /// [`crate::Splats::antialiased`] of the parts.
     pub(super) antialiased: Vec<bool>,
-    /// Splats kept.
+    /// Number of packed splats.
     pub(super) len: usize,
-    /// How far splats may be rendered from where they are. [px]
+    /// Maximum error of the position of splats. [px]
     pub(super) max_error_px: f32,
 }
 
-/// Some consecutive blocks.
+/// Range of consecutive blocks.
 #[derive(Debug)]
 pub(super) struct Chunk {
     /// `Chunk` of `project.wgsl`.
@@ -59,7 +59,7 @@ struct Bounds {
     half_m: [f32; 3],
     part: u32,
     error_m: f32,
-    /// The block that stands for this one, or [`NONE`].
+    /// Parent block, or [`NONE`].
     parent: u32,
     padding: [u32; 2],
 }
@@ -69,17 +69,17 @@ const _: () = assert!(size_of::<Bounds>() == 48);
 /// `NONE` of `cull.wgsl`.
 const NONE: u32 = u32::MAX;
 
-/// A block before it is uploaded.
+/// Block before its upload.
 #[derive(Clone, Copy)]
 struct Pending<'a> {
     part: u32,
     packed: &'a Part,
-    /// Which of its blocks.
+    /// Block index within the part.
     block: usize,
 }
 
 impl Pending<'_> {
-    /// Words of its harmonics.
+    /// Returns the number of words of its harmonics.
     fn harmonics_words(&self) -> usize {
         self.packed.sh_numbers() * BLOCK / 2
     }
@@ -130,14 +130,14 @@ impl GpuScene {
     }
 }
 
-/// Returns the bounds of a part's blocks, the first of which is the scene's `first`.
+/// Returns the bounds of a part's blocks; `first` is the scene's index of its first block.
 fn all_bounds(part: u32, packed: &Part, first: usize) -> impl Iterator<Item = Bounds> {
     let begins = packed.levels.iter().copied();
     let ends = begins.clone().skip(1).chain([packed.blocks.len()]);
     begins.zip(ends).flat_map(move |(begin, end)| {
         packed.blocks[begin..end].iter().enumerate().map(move |(i, block)| {
             let Block { center_m, half_m, reach_m, error_m } = *block;
-            // Nothing stands for the coarsest level.
+            // Blocks of the coarsest level have no parent.
             let is_last = end == packed.blocks.len();
             let parent = if is_last { NONE } else { (first + end + i / BRANCH) as u32 };
             let (center_m, half_m) = (center_m.to_array(), half_m.to_array());
@@ -146,7 +146,7 @@ fn all_bounds(part: u32, packed: &Part, first: usize) -> impl Iterator<Item = Bo
     })
 }
 
-/// Returns how many of the next blocks one chunk can hold.
+/// Returns the number of the next blocks that fit one chunk.
 fn fitting(blocks: &[Pending<'_>], binding_bytes: u64) -> usize {
     let words = usize::try_from(binding_bytes / 4).unwrap_or(usize::MAX);
     let most = (words / STRIDE).min(MAX_BLOCKS);
@@ -158,7 +158,7 @@ fn fitting(blocks: &[Pending<'_>], binding_bytes: u64) -> usize {
     blocks.iter().take(most).take_while(fits).count()
 }
 
-/// Packs a chunk and uploads it in slices, so that the host holds little twice.
+/// Packs a chunk and uploads it in slices, so that the host holds only a small part of it twice.
 fn upload(device: &Device, first_block: u32, blocks: &[Pending<'_>]) -> Chunk {
     let words: usize = blocks.iter().map(Pending::harmonics_words).sum();
     let geometry = device.storage("geometry", (blocks.len() * STRIDE * 4) as u64);
@@ -169,7 +169,7 @@ fn upload(device: &Device, first_block: u32, blocks: &[Pending<'_>]) -> Chunk {
         let mut numbers = Vec::with_capacity(slice.len() * STRIDE);
         let mut halves = Vec::new();
         for (mut columns, block_halves) in packed {
-            // The header names the place that only the whole chunk knows.
+            // The header contains the position within the chunk, which is known only here.
             columns[1] = (harmonics_at + halves.len()) as u32;
             numbers.append(&mut columns);
             halves.extend(block_halves);
@@ -177,7 +177,7 @@ fn upload(device: &Device, first_block: u32, blocks: &[Pending<'_>]) -> Chunk {
         let queue = &device.queue;
         queue.write_buffer(&geometry, (block_at * STRIDE * 4) as u64, numbers.as_bytes());
         queue.write_buffer(&harmonics, (harmonics_at * 4) as u64, halves.as_bytes());
-        // Lets go of the staging memory of this slice.
+        // Frees the staging memory of this slice.
         queue.submit([]);
         block_at += slice.len();
         harmonics_at += halves.len();
@@ -186,10 +186,10 @@ fn upload(device: &Device, first_block: u32, blocks: &[Pending<'_>]) -> Chunk {
     Chunk { place, geometry, harmonics, blocks: blocks.len() as u32 }
 }
 
-/// 25 MB of geometry.
+/// Blocks per slice: 25 MB of geometry.
 const BLOCKS_PER_UPLOAD: usize = 2048;
 
-/// Returns a block's header and columns, and its harmonics.
+/// Returns the header and columns of a block, and its harmonics.
 fn pack(block: &Pending<'_>) -> (Vec<u32>, Vec<u32>) {
     let Pending { part, packed, block } = *block;
     let numbers = packed.sh_numbers();
@@ -223,7 +223,7 @@ mod tests {
     use crate::{CpuRenderer, Detail, Splats};
 
     #[test]
-    fn a_block_lies_within_the_one_that_stands_for_it() {
+    fn blocks_lie_within_their_parent() {
         for count in [0usize, 100, 256, 1024, 5000, 20_000] {
             let mut splats = Splats::default();
             for i in 0..count {
@@ -241,7 +241,7 @@ mod tests {
             for (i, block) in bounds.iter().enumerate() {
                 assert_eq!(block.part, 3);
                 if block.parent == NONE {
-                    assert_eq!(i + 1, bounds.len(), "one stands for all");
+                    assert_eq!(i + 1, bounds.len(), "one block represents all");
                     continue;
                 }
                 let above = &bounds[block.parent as usize - 7];

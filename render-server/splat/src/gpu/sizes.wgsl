@@ -1,6 +1,6 @@
-// What the device counts on its own, so that nothing is read back in mid-frame.
+// Counts of the device, so that nothing is read back within a tick.
 
-/// Indices into `sizes`; `read.rs` reads the same.
+/// Indices into `sizes`; `read.rs` uses the same.
 const REGIONS_WANTED = 0u;
 /// Slots in use, BLOCK per region.
 const SLOTS = 1u;

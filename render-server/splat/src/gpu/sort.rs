@@ -1,14 +1,14 @@
-//! Pass 4: each tile's list, nearest first.
+//! Pass 4: sorts the list of each tile from near to far.
 //!
-//! Budget: 16 bytes moved per pair; comparisons in workgroup memory: some 50 per pair in a list of 1024,
-//! a microsecond or two. Longer lists merge their runs of 1024: 16 bytes moved per pair and doubling.
+//! Budget: 16 bytes moved per pair. Comparisons in workgroup memory: about 50 per pair in a list of 1024, one to two
+//! microseconds. Longer lists merge their runs of 1024: 16 bytes moved per pair and doubling.
 
 use super::buffers::Buffers;
 use super::device::{Device, Groups, Kernel};
 
 const SOURCE: &str = concat!(include_str!("common.wgsl"), include_str!("sort.wgsl"));
 
-/// The pass.
+/// Pass with its kernel.
 #[derive(Debug)]
 pub(super) struct Sort {
     kernel: Kernel,

@@ -1,7 +1,7 @@
-// Pass 4: each tile's list, nearest first. One workgroup per tile.
+// Pass 4: sorts the list of each tile from near to far. One workgroup per tile.
 //
-// Runs of CHUNK pairs are sorted in workgroup memory by a bitonic network; longer lists merge their runs in
-// the device's memory, each time into the other buffer, and end in the first.
+// Runs of CHUNK pairs are sorted in workgroup memory by a bitonic network. Longer lists merge their runs in the
+// device's memory, alternating between both buffers, and end in the first.
 
 @group(0) @binding(0) var<uniform> tick: Tick;
 @group(0) @binding(1) var<storage, read> firsts: array<u32>;
@@ -12,25 +12,25 @@
 
 const CHUNK = 1024u;
 const THREADS = 256u;
-/// Workgroups along x at most.
+/// Maximum number of workgroups along x.
 const GRID = 32768u;
-/// Pairs that a thread merges one after the other.
+/// Number of pairs that a thread merges one after the other.
 const STRIP = 16u;
 
 var<workgroup> run: array<vec2<u32>, CHUNK>;
 var<workgroup> own_list: vec2<u32>;
 
-/// Whether a pair is nearer; those at one depth stay in order of the scene.
+/// Returns whether a pair is nearer; pairs of equal depth stay in scene order.
 fn is_before(a: vec2<u32>, b: vec2<u32>) -> bool {
     return a.x < b.x || (a.x == b.x && a.y < b.y);
 }
 
-/// Returns two pairs, the nearer one first; last, if not `is_up`.
+/// Returns two pairs, the nearer one first if `is_up`, otherwise last.
 fn ordered(a: vec2<u32>, b: vec2<u32>, is_up: bool) -> vec4<u32> {
     return select(vec4(a, b), vec4(b, a), is_before(b, a) == is_up);
 }
 
-/// Sorts a run of `pairs`; leaves it there, or in `other`.
+/// Sorts a run of `pairs` in place, or writes it to `other`.
 fn sort_run(thread: u32, first: u32, count: u32, stays: bool) {
     var size = 2u;
     while size < count {
@@ -45,7 +45,8 @@ fn sort_run(thread: u32, first: u32, count: u32, stays: bool) {
     workgroupBarrier();
     for (var block = 2u; block <= size; block *= 2u) {
         var step = block / 2u;
-        // Steps go two at a time, a quarter of the run's pairs to the left: an odd one goes first.
+        // Two steps at a time, each thread with four pairs of the run: an odd number of steps
+        // starts with a single one.
         if countTrailingZeros(block) % 2u == 1u {
             for (var i = thread; i < size / 2u; i += THREADS) {
                 let low = 2u * i - (i & (step - 1u));
@@ -90,14 +91,14 @@ fn at(i: u32, in_other: bool) -> vec2<u32> {
     return pairs[i];
 }
 
-/// Merges neighbouring runs of so many pairs, from one buffer into the other.
+/// Merges neighbouring runs of `length` pairs, from one buffer into the other.
 fn merge(thread: u32, first: u32, count: u32, length: u32, from_other: bool) {
     for (var start = thread * STRIP; start < count; start += THREADS * STRIP) {
-        // Its two runs: a, b, of the list's pairs from these on.
+        // The two runs: a, and b, as ranges of the list.
         let a = start / (2u * length) * 2u * length;
         let b = min(a + length, count);
         let end = min(b + length, count);
-        // How many of the first `start - a` pairs are of run a.
+        // Number of the first `start - a` merged pairs that are from run a.
         let before = start - a;
         var low = before - min(before, end - b);
         var high = min(before, b - a);

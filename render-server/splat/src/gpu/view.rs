@@ -1,4 +1,4 @@
-//! Cameras and sizes in the numbers the shaders use. f64 here, once per image; f32 there.
+//! Cameras and sizes in the form of the shaders. Computed in f64 once per image, stored as f32.
 
 use glam::{DMat3, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Distortion, Frame, Intrinsics, Pose};
@@ -42,27 +42,27 @@ pub(super) struct GpuView {
 
 const _: () = assert!(size_of::<Tick>() == 32 && size_of::<GpuView>() == 304);
 
-/// Where an image lies among the images of its tick.
+/// Position of an image among the images of its tick.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct ImageOffset {
     pub(super) first_tile: u32,
     pub(super) first_pixel: u32,
 }
 
-/// What of a lens takes long to find.
+/// Values of a lens that are expensive to compute.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Lens {
     slopes: [DVec2; 2],
     reach: f64,
 }
 
-/// The lenses of the last few cameras.
+/// Cache of lenses.
 #[derive(Debug, Default)]
 pub(super) struct Lenses {
     known: Vec<(Intrinsics, Lens)>,
 }
 
-/// More different cameras than this at once find their lenses again for every image.
+/// Capacity of the cache. With more different cameras at once, lenses are recomputed for every image.
 const MAX_LENSES: usize = 32;
 
 impl Lenses {
@@ -81,7 +81,7 @@ impl Lenses {
 }
 
 impl GpuView {
-    /// Prepares a validated camera as a part of the scene sees it that stands at `part_from_cam`.
+    /// Prepares a validated camera, for a part relative to which it has the pose `part_from_cam`.
     pub(super) fn new<F: Frame>(
         camera: &Camera,
         lens: &Lens,
@@ -100,7 +100,7 @@ impl GpuView {
         let [low, high] = lens.slopes;
         let (model, coefficients) = k.distortion.to_wire();
         let c = coefficients.map(|c| c as f32);
-        // Infinite for a pinhole, which the shader does not ask.
+        // Infinite for a pinhole, for which the shader does not use it.
         let reach = lens.reach.min(f64::from(f32::MAX)) as f32;
         let (planes, weights) = planes(camera, lens, &rotation);
         let [r, g, b] = camera.atmosphere.background(camera.background);
@@ -121,27 +121,27 @@ impl GpuView {
         }
     }
 
-    /// Returns a view of which only the size is known: width, height [px], tiles across, tiles.
+    /// Returns a view with only the size set: width, height [px], tiles across, tiles.
     pub(super) fn of_size([width, height, across, _]: [u32; 4]) -> Self {
         Self { size: [width, height, across, 0], ..Self::default() }
     }
 
-    /// Is the view of a part that is not there.
+    /// Returns the view of an absent part.
     pub(super) fn absent() -> Self {
         Self::default()
     }
 }
 
-/// Returns the planes `normal . (p - camera) + reach * weight >= offset` between which a splat may
-/// touch the image: normal and offset, and the weights.
+/// Returns the planes `normal . (p - camera) + reach * weight >= offset` between which a splat may touch the image:
+/// normals with offsets, and weights.
 fn planes(camera: &Camera, lens: &Lens, rotation: &DMat3) -> ([[f32; 4]; 5], [[f32; 4]; 2]) {
     let k = &camera.intrinsics;
     let [x, y, z] = [rotation.row(0), rotation.row(1), rotation.row(2)];
-    // The first plane is the near plane, of the centres alone.
+    // The first plane is the near plane, which applies to the centres only.
     let mut planes = [[z.x as f32, z.y as f32, z.z as f32, camera.near_m]; 5];
     let mut weights = [[0f32; 4]; 2];
     if k.distortion != Distortion::None {
-        // A lens bends the image's border: all that is ahead is projected.
+        // A lens bends the border of the image: everything in front of the camera is projected.
         return (planes, weights);
     }
     // A splat's mean is at u = fx x/z + cx; its extent is at most

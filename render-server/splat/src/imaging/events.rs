@@ -1,51 +1,53 @@
-//! An event camera: every pixel reports when its brightness has changed by a given share, and nothing else.
+//! Event camera: each pixel reports changes of its brightness by a given share.
 //!
-//! The model of ESIM (H. Rebecq, D. Gehrig, D. Scaramuzza, CoRL 2018): a pixel keeps the logarithm of the intensity at which it last
-//! fired; between two images the logarithm is taken as linear in time, and each time that it is a contrast threshold away from what
-//! was kept, an event with the instant and the sign is given, and what was kept moves by the threshold. A dead time drops events that
-//! come too soon after the pixel's last. The intensity is linear luminance plus a little, so that black has a logarithm.
+//! The model is that of ESIM (H. Rebecq, D. Gehrig, D. Scaramuzza, CoRL 2018). A pixel stores the logarithm of the
+//! intensity of its last event. Between two images the logarithm is assumed to be linear in time. Each time it
+//! differs from the stored value by a contrast threshold, an event with time and sign is emitted, and the stored
+//! value moves by the threshold. A dead time drops events that follow the pixel's last event too closely. The
+//! intensity is linear luminance plus a small constant, so that black has a logarithm.
 //!
-//! The faster the images follow each other, the better: between two of them what moves by more than a pixel makes no events on its way.
+//! A high image rate improves the result: movement by more than a pixel between two images produces no events on the
+//! way.
 
 use super::tone;
 use super::tone::luminance;
 use crate::RgbdImage;
 
-/// What an event camera is like.
+/// Parameters of an event camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EventSensor {
-    /// Contrast threshold upwards, of the natural logarithm: 0.2 is 22 % brighter.
+    /// Contrast threshold for increasing brightness, in the natural logarithm: 0.2 is 22 % brighter.
     pub threshold_on: f32,
-    /// Contrast threshold downwards.
+    /// Contrast threshold for decreasing brightness.
     pub threshold_off: f32,
-    /// After an event a pixel is silent for so long. [ns]
+    /// Dead time of a pixel after an event. [ns]
     pub dead_ns: u64,
     /// Linear luminance that is added to every pixel.
     pub dark: f32,
 }
 
 impl Default for EventSensor {
-    /// Thresholds of 20 %, of which a DVS240 has 15 to 50 (P. Lichtsteiner, C. Posch, T. Delbruck, IEEE JSSC 43, 2008: 15 %), no
-    /// dead time.
+    /// Thresholds of 20 %; a DVS240 has 15 to 50 (P. Lichtsteiner, C. Posch, T. Delbruck, IEEE JSSC 43, 2008: 15 %).
+    /// No dead time.
     fn default() -> Self {
         Self { threshold_on: 0.2, threshold_off: 0.2, dead_ns: 0, dark: 0.001 }
     }
 }
 
-/// One pixel's brightness has changed.
+/// Brightness change of one pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Event {
-    /// When. [ns]
+    /// Time of the event. [ns]
     pub t_ns: u64,
     /// Row.
     pub y: u16,
     /// Column.
     pub x: u16,
-    /// Whether it has become brighter.
+    /// Whether the brightness increased.
     pub on: bool,
 }
 
-/// The state of an event camera's pixels.
+/// State of the pixels of an event camera.
 #[derive(Clone, Debug, Default)]
 pub struct EventCamera {
     size: (u32, u32),
@@ -59,13 +61,14 @@ struct PixelState {
     last: f32,
     /// Logarithm at the last event.
     kept: f32,
-    /// Silent until then. [ns]
+    /// End of the dead time. [ns]
     silent_until_ns: u64,
 }
 
 impl EventCamera {
-    /// Takes the image of an instant and appends what happened since the last one to `events`, in order of time, then row, then
-    /// column. The first image, one of another size, and one that is not later than the last, start anew and give none.
+    /// Processes the image of an instant, and appends the events since the last one to `events`, ordered by time,
+    /// then row, then column. The first image, one of another size, and one that is not later than the last reset the
+    /// state and produce no events.
     pub fn push(
         &mut self,
         sensor: &EventSensor,
@@ -104,7 +107,7 @@ impl EventCamera {
 }
 
 impl PixelState {
-    /// Gives the events of one pixel until its logarithm is `now`.
+    /// Emits the events of one pixel until its logarithm is `now`.
     fn cross(
         &mut self,
         sensor: &EventSensor,
@@ -116,7 +119,8 @@ impl PixelState {
         let on = now > self.last;
         let step = if on { sensor.threshold_on } else { -sensor.threshold_off };
         let slope = f64::from(now) - f64::from(self.last);
-        // Counted from what was kept, so that rounding does not add up; an infinite count is bounded.
+        // Computed from the stored value, so that rounding errors do not accumulate. The number of iterations is
+        // bounded, because it could be infinite.
         for _ in 0..MOST_EVENTS {
             let next = self.kept + step;
             let is_reached = if on { next <= now } else { next >= now };
@@ -135,7 +139,7 @@ impl PixelState {
     }
 }
 
-/// Of a pixel between two images: from black to white with a threshold of 1 % are 700.
+/// Maximum number of events of a pixel between two images; black to white with a threshold of 1 % gives 700.
 const MOST_EVENTS: usize = 4096;
 
 #[cfg(test)]
@@ -146,9 +150,10 @@ mod tests {
     const SENSOR: EventSensor =
         EventSensor { threshold_on: 0.2, threshold_off: 0.3, dead_ns: 0, dark: 0.0 };
 
-    /// An even grey image whose linear luminance is as close to `light` as display colours go.
+    /// Returns a uniform grey image whose linear luminance is as close to `light` as display colours allow, and that
+    /// luminance.
     fn grey(light: f64) -> (RgbdImage, f64) {
-        // The inverse of the tone curve, by halving.
+        // Inverse of the tone curve by bisection.
         let tone = Tone::default();
         let (mut low, mut high) = (0f32, 1f32);
         for _ in 0..40 {
@@ -170,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn count_and_instants_are_those_of_the_contrast() {
+    fn event_count_and_times_follow_from_the_contrast() {
         let all = events(&SENSOR, &[(0.1, 1_000_000), (0.5, 11_000_000)]);
         let (first, last) = (grey(0.1).1, grey(0.5).1);
         let contrast = libm::log(last / first);
@@ -180,7 +185,7 @@ mod tests {
             let of = all.iter().filter(|event| (event.x, event.y) == (pixel % 3, pixel / 3));
             for (n, event) in of.enumerate() {
                 assert!(event.on);
-                // The n-th threshold is reached when its share of the change is done.
+                // The n-th threshold is reached after its share of the change.
                 let at_ns = 1e6 + 1e7 * 0.2 * (n + 1) as f64 / contrast;
                 assert!((event.t_ns as f64 - at_ns).abs() < 100.0, "{event:?}, not {at_ns}");
             }
@@ -189,21 +194,21 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_over_counts_next_time() {
-        // Three times 0.15: thresholds are crossed in the second and third image only.
+    fn change_below_the_threshold_is_carried_over() {
+        // Three times 0.15: thresholds are crossed only in the second and third image.
         let lights: Vec<_> =
             (0..4u64).map(|n| (0.2 * libm::exp(0.15 * n as f64), 1_000 + n * 1_000_000)).collect();
         let all = events(&SENSOR, &lights);
         assert_eq!(all.len(), 6 * 2);
         assert!(all[0].t_ns > 1_001_000 && all[6].t_ns > 2_001_000);
-        // Downwards by the other threshold; a step within the threshold gives none.
+        // Decreasing brightness uses the other threshold; a step within the threshold gives no event.
         let down = events(&SENSOR, &[(0.5, 1), (0.5 * libm::exp(-0.7), 1000)]);
         assert!(down.len() == 6 * 2 && down.iter().all(|event| !event.on));
         assert!(events(&SENSOR, &[(0.5, 1), (0.45, 1000), (0.52, 2000)]).is_empty());
     }
 
     #[test]
-    fn dead_time_and_poison() {
+    fn applies_the_dead_time_and_survives_nan_and_infinity() {
         let dead = EventSensor { dead_ns: 4_000_000, ..SENSOR };
         let all = events(&dead, &[(0.1, 0), (0.5, 10_000_000)]);
         let gaps = |all: &[Event]| {
@@ -211,7 +216,7 @@ mod tests {
             of.windows(2).map(|pair| pair[1] - pair[0]).min()
         };
         assert!(gaps(&all).unwrap() >= 4_000_000 && all.len() < 6 * 8);
-        // NaN and infinity are black and white; nothing is endless.
+        // NaN and infinity are treated as black and white, and the loop ends.
         let sensor = EventSensor { dark: 0.001, ..SENSOR };
         let (mut camera, mut all) = (EventCamera::default(), Vec::new());
         for (n, value) in [f32::NAN, f32::INFINITY, -1.0, f32::NEG_INFINITY].into_iter().enumerate()
@@ -222,7 +227,7 @@ mod tests {
         }
         assert_eq!(all.iter().filter(|event| event.on).count(), 6 * 34);
         assert_eq!(all.iter().filter(|event| !event.on).count(), 6 * 22);
-        // Time that does not go on starts anew.
+        // A time that does not advance resets the state.
         camera.push(&sensor, &grey(0.9).0, 2, &mut all);
         assert_eq!(all.len(), 6 * 56);
     }

@@ -1,16 +1,18 @@
-//! Cameras as they are: what a sensor makes of a perfect rendered image, in place.
+//! Realistic cameras: applies the effects of a sensor to a perfect rendered image, in place.
 //!
 //! ```text
-//! RgbdImage, perfect --> Imager::apply --> the same image as the camera gives it
-//!   colour  display colours -> linear light [`tone`] -> exposure, automatic with its lag [`exposure`] -> each row's path while
-//!           it is exposed [`shutter`] -> electrons, noise, numbers [`noise`] -> mosaic, denoising [`mosaic`] -> display colours
-//!   depth   as a stereo pair [`stereo`] or a time-of-flight camera [`tof`] measures it
+//! perfect RgbdImage --> Imager::apply --> image of the camera
+//!   colour  display colours -> linear light [`tone`] -> exposure, fixed or automatic [`exposure`]
+//!           -> path of each row during its exposure [`shutter`] -> electrons, noise, numbers [`noise`]
+//!           -> mosaic, denoising [`mosaic`] -> display colours
+//!   depth   measured by a stereo pair [`stereo`] or a time-of-flight camera [`tof`]
 //! ```
-//! Pure: a function of (image, model, path, key, time since the last image) and of the exposure's own state. The same bits for
-//! any number of threads. Callers are the server's render thread and graded flights, once an image; buffers are kept, and nothing
-//! is allocated once they have grown. Bounded by arithmetic: some 30 ns a pixel and core with everything on.
+//! The result depends only on (image, model, path, key, time since the last image) and on the state of the exposure.
+//! It is bit-identical for any number of threads. Callers are the server's render thread and graded flights, once per
+//! image. Buffers are reused, so nothing is allocated after they have grown. Limited by arithmetic: about 30 ns per
+//! pixel and core with all effects.
 //!
-//! An event camera ([`events`]) is another sensor: it takes a sequence of images.
+//! An event camera ([`events`]) is a separate sensor: its input is a sequence of images.
 
 pub mod events;
 pub mod exposure;
@@ -36,81 +38,81 @@ use self::tof::Tof;
 use self::tone::{Tone, luminance};
 use crate::{Camera, RgbdImage};
 
-/// How a camera differs from a perfect one.
+/// Sensor effects of a camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CameraModel {
-    /// Its colour images; `None` is a perfect one.
+    /// Colour sensor; `None` is a perfect one.
     pub sensor: Option<Sensor>,
-    /// Its depth.
+    /// Depth sensor.
     pub depth: DepthModel,
 }
 
-/// How depth is measured.
+/// Measurement principle of depth.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum DepthModel {
-    /// As it is.
+    /// True depth.
     #[default]
     Perfect,
-    /// By a stereo pair.
+    /// Stereo pair.
     Stereo(Stereo),
-    /// By the time that light takes.
+    /// Time of flight.
     Tof(Tof),
 }
 
-/// An image sensor behind its lens. All figures are of a pixel of the image: where one joins `n` of the sensor, electrons and
-/// full well are theirs together, and read noise `sqrt(n)` times theirs.
+/// Image sensor behind its lens. All values are per pixel of the image: if it combines `n` pixels of the sensor,
+/// electrons and full well are their sums, and read noise is `sqrt(n)` times that of one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sensor {
-    /// Most electrons that a pixel holds. [e]
+    /// Full well capacity of a pixel. [e]
     pub full_well_e: f64,
-    /// Of reading a pixel, standard deviation. [e]
+    /// Read noise of a pixel, standard deviation. [e]
     pub read_noise_e: f64,
-    /// Electrons that linear light of 1, the brightest that the scene's file shows, makes in a second. [e/s]
+    /// Electrons per second for linear light of 1, the brightest light in the scene's file. [e/s]
     pub electrons_per_s: f64,
-    /// Bits of the converter, 8 to 16.
+    /// Resolution of the converter, 8 to 16 bits.
     pub bits: u32,
-    /// What lies before the pixels.
+    /// Colour filter in front of the pixels.
     pub filter: ColorFilter,
-    /// Whether what is read is denoised.
+    /// Whether images are denoised.
     pub denoise: bool,
-    /// Whether there is photon and read noise.
+    /// Whether photon noise and read noise are added.
     pub noise: bool,
-    /// Share of the light that the corners lack, 0 to 1.
+    /// Relative loss of light in the corners, 0 to 1.
     pub vignette: f64,
-    /// From the first row's exposure to the last one's; 0 is a global shutter. [s]
+    /// Time from the first row's exposure to the last one's; 0 is a global shutter. [s]
     pub readout_s: f64,
-    /// What decides shutter and gain.
+    /// Control of shutter and gain.
     pub exposure: ExposureControl,
 }
 
-/// Where a camera is, seconds from the instant that its image shows. [s]
+/// Pose of a camera at a time relative to the instant of its image. [s]
 pub type Path<'a> = dyn Fn(f64) -> Pose<World, Cam> + Sync + 'a;
 
-/// One image that is taken.
+/// One image to be taken.
 #[derive(Clone, Copy)]
 pub struct Shot<'a> {
-    /// What was rendered: at the middle of the middle row's exposure.
+    /// Camera of the rendered image, at the middle of the middle row's exposure.
     pub camera: &'a Camera,
-    /// How it moves about then.
+    /// Path of the camera around that instant.
     pub path: &'a Path<'a>,
-    /// The instant, on a clock that goes on from image to image. [s]
+    /// Instant of the image, on a clock that is common to all images. [s]
     pub at_s: f64,
-    /// What its noise is made from.
+    /// Key of the random noise.
     pub key: NoiseKey,
 }
 
-/// The state of one camera: its exposure, and buffers.
+/// State of one camera: its exposure, and buffers.
 #[derive(Debug, Default)]
 pub struct Imager {
     follow: Follow,
     last_s: Option<f64>,
     lens: Option<Intrinsics>,
     pixels: Vec<Pixel>,
-    /// Linear light as it was rendered, H x W x 3.
+    /// Linear light of the rendered image, H x W x 3.
     light: Vec<f32>,
-    /// Linear light that each row collects, H x W x 3; then what is read of it.
+    /// Linear light that each row collects, H x W x 3; then its digitised values.
     exposed: Vec<f32>,
-    /// What is read of a mosaic, H x W.
+    /// Digitised values of a mosaic, H x W.
     mosaic: Vec<f32>,
     denoised: Vec<f32>,
     depth: Vec<f32>,
@@ -119,11 +121,11 @@ pub struct Imager {
 }
 
 impl Imager {
-    /// Turns a perfect image into the one that the camera gives; returns how it was exposed. Depth that is measured is in both
-    /// of the image's depths, in whole millimetres, with alpha 1 where there is a return; ids stay those of the perfect image.
+    /// Converts a perfect image to that of the camera. Returns its exposure. Measured depth is written to both depths
+    /// of the image, in whole millimetres, with alpha 1 where there is a return; ids stay those of the perfect image.
     ///
     /// # Panics
-    /// If the image is not of the camera's size.
+    /// If the image does not have the camera's size.
     pub fn apply(
         &mut self,
         model: &CameraModel,
@@ -138,7 +140,7 @@ impl Imager {
         let exposure = model.sensor.map(|sensor| self.take(&sensor, shot, image));
         if is_measured {
             for (alpha, &depth_m) in image.alpha.iter_mut().zip(&self.depth) {
-                // What is fattened over nothing is a return, too.
+                // Depth that is fattened over empty space is also a return.
                 *alpha = if depth_m > 0.0 { 1.0 } else { *alpha };
             }
             image.depth_expected_m.copy_from_slice(&self.depth);
@@ -147,7 +149,7 @@ impl Imager {
         exposure
     }
 
-    /// Gives buffers their sizes; what depends on the lens alone is made once.
+    /// Resizes the buffers, and recomputes values that depend on the lens only if it has changed.
     fn prepare(&mut self, camera: &Camera, image: &RgbdImage) {
         let k = &camera.intrinsics;
         assert_eq!((image.width_px, image.height_px), (k.width_px, k.height_px));
@@ -170,7 +172,7 @@ impl Imager {
         });
     }
 
-    /// Measures depth into `self.depth`; returns whether it is not perfect.
+    /// Measures depth into `self.depth`. Returns `false` for perfect depth, which is not written.
     fn measure_depth(&mut self, model: &DepthModel, shot: &Shot<'_>, image: &RgbdImage) -> bool {
         let k = &shot.camera.intrinsics;
         match model {
@@ -198,7 +200,7 @@ impl Imager {
         let mean = mean_light(&self.light);
         let exposure = sensor.exposure.next(&mut self.follow, mean, full_s, dt_s);
         let readout = sensor.readout(&exposure);
-        // Of a single row or column there is nothing to interpolate.
+        // A single row or column cannot be interpolated.
         let is_line = width < 2 || height < 2;
         let filter = if is_line { ColorFilter::Rgb } else { sensor.filter };
 
@@ -263,7 +265,7 @@ impl Sensor {
     }
 }
 
-/// Converts light to numbers, row by row.
+/// Digitises light, row by row.
 struct RowReader<'a> {
     readout: &'a Readout,
     vignette: f32,
@@ -275,7 +277,7 @@ struct RowReader<'a> {
 }
 
 impl RowReader<'_> {
-    /// Reads row `y` of light out: in place, or into its row of the mosaic.
+    /// Digitises row `y` of light, in place or into its row of the mosaic.
     fn read(&self, y: usize, line: &mut [f32], mosaic: &mut [f32]) {
         let table = Normals::table();
         let &Self { readout, vignette, filter, key, width, height } = self;
@@ -301,7 +303,7 @@ impl RowReader<'_> {
     }
 }
 
-/// Returns the mean luminance, of every so many pixels.
+/// Returns the mean luminance of every [`METERED`]th pixel.
 fn mean_light(light: &[f32]) -> f64 {
     let (mut sum, mut count) = (0.0, 0u32);
     for rgb in light.chunks_exact(3).step_by(METERED) {
@@ -311,13 +313,13 @@ fn mean_light(light: &[f32]) -> f64 {
     sum / f64::from(count.max(1))
 }
 
-/// Returns the tables of tones: 80 kB, made once.
+/// Returns the tone tables: 80 kB, created once.
 fn tone() -> &'static Tone {
     static TONE: LazyLock<Tone> = LazyLock::new(Tone::default);
     &TONE
 }
 
-/// Prime, so that no column of an image is looked at more than others.
+/// Step between metered pixels. Prime, so that all columns of an image are sampled.
 const METERED: usize = 31;
 
 #[cfg(test)]

@@ -1,42 +1,42 @@
-//! The colour filter and what a camera's processor makes of it: the Bayer mosaic, its bilinear interpolation, and denoising.
+//! Colour filter and image processing of a camera: Bayer mosaic, bilinear interpolation, and denoising.
 
 use super::noise::Readout;
 
-/// What lies before the pixels.
+/// Colour filter in front of the pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ColorFilter {
-    /// Every pixel sees three colours, as one that is joined from many does.
+    /// Three colours per pixel, as in an image that combines many sensor pixels.
     #[default]
     Rgb,
-    /// One colour a pixel, `RG` over `GB` (Bayer, US patent 3971065), interpolated afterwards.
+    /// One colour per pixel, `RG` over `GB` (Bayer, US patent 3971065), interpolated afterwards.
     Bayer,
-    /// None: every pixel sees the luminance.
+    /// Luminance only.
     Mono,
 }
 
 impl ColorFilter {
-    /// Returns how far apart pixels of one colour are. [px]
+    /// Returns the distance between pixels of the same colour. [px]
     pub(super) fn pitch(self) -> usize {
         if self == Self::Bayer { 2 } else { 1 }
     }
 
-    /// Returns the values that each pixel has before the mosaic is interpolated.
+    /// Returns the number of values per pixel before interpolation of the mosaic.
     pub(super) fn channels(self) -> usize {
         if self == Self::Rgb { 3 } else { 1 }
     }
 }
 
-/// Returns which colour a Bayer pixel sees: 0 red, 1 green, 2 blue.
+/// Returns the colour of a Bayer pixel: 0 red, 1 green, 2 blue.
 #[inline]
 pub(super) fn bayer_color(x: usize, y: usize) -> usize {
     (x & 1) + (y & 1)
 }
 
-/// Writes row `y` of a mosaic as colours: each that is missing is the mean of its nearest neighbours (bilinear). The image is
-/// reflected at its border, which keeps the colours of the pattern.
+/// Writes row `y` of a mosaic as colours: each missing colour is the mean of its nearest neighbours (bilinear). The
+/// image is reflected at its border, which keeps the colour pattern.
 ///
 /// # Panics
-/// If the mosaic is not of this width and at least 2 x 2.
+/// If the mosaic does not have this width, or is smaller than 2 x 2.
 pub(super) fn demosaic_row(mosaic: &[f32], width: usize, y: usize, out: &mut [f32]) {
     let height = mosaic.len() / width;
     assert!(width >= 2 && height >= 2 && out.len() == 3 * width);
@@ -55,7 +55,7 @@ pub(super) fn demosaic_row(mosaic: &[f32], width: usize, y: usize, out: &mut [f3
         let rgb = match bayer_color(x, y) {
             0 => [own, around, crossed],
             2 => [crossed, around, own],
-            // Green: red is beside it in red rows, above it in blue ones.
+            // Green: red is left and right of it in red rows, above and below it in blue rows.
             _ if odd_row => [upright, own, beside],
             _ => [beside, own, upright],
         };
@@ -63,8 +63,8 @@ pub(super) fn demosaic_row(mosaic: &[f32], width: usize, y: usize, out: &mut [f3
     }
 }
 
-/// Writes row `y` denoised: the mean of those of the nine nearest pixels of its colour that are within two standard deviations
-/// of it, so that edges stay (the sigma filter: J.-S. Lee, CVGIP 1983).
+/// Writes row `y` denoised: each pixel is the mean of those of the nine nearest pixels of its colour that are within
+/// two standard deviations of it, so that edges remain (sigma filter: J.-S. Lee, CVGIP 1983).
 pub(super) fn denoise_row(
     raw: &[f32],
     (width, height): (usize, usize),
@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn even_colours_and_slopes_survive_the_mosaic() {
+    fn interpolation_keeps_constant_colours_and_gradients() {
         let (width, height) = (8, 6);
         let color =
             |x: usize, y: usize, c: usize| [0.2, 0.5, 0.7][c] + 0.01 * x as f32 - 0.02 * y as f32;
@@ -118,7 +118,7 @@ mod tests {
                 }
             }
         }
-        // At the border colours do not mix.
+        // Colours do not mix at the border.
         let flat: Vec<f32> = (0..4).map(|n| [0.2, 0.5, 0.7][bayer_color(n % 2, n / 2)]).collect();
         let mut out = vec![0.0; 6];
         for y in 0..2 {
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn denoising_keeps_edges_and_takes_two_fifths_of_the_noise() {
+    fn denoising_keeps_edges_and_removes_two_fifths_of_the_noise() {
         let readout = Readout {
             electrons: 4000.0,
             full_well_e: 4000.0,

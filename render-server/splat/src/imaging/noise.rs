@@ -1,29 +1,32 @@
-//! Photon and read noise, by the linear model of EMVA 1288 (release 3.1, section 2): a pixel that `mu` electrons are expected in has
-//! the variance `mu + read^2` electrons, is cut by its full well, and is rounded to the converter's numbers:
+//! Photon noise and read noise by the linear model of EMVA 1288 (release 3.1, section 2): a pixel with `mu` expected
+//! electrons has the variance `mu + read^2` electrons, is limited by its full well, and is rounded to the numbers of
+//! the converter:
 //!
 //! ```text
 //! mean  = K mu              K: numbers of the converter per electron
 //! var   = K^2 (read^2 + mu) + 1/12
 //! ```
-//! The photons' Poisson distribution is taken as a normal one of its variance, which is good from some ten electrons on.
+//! The Poisson distribution of photons is approximated by a normal distribution of the same variance, which is
+//! accurate from about ten electrons on.
 //!
-//! Random numbers are hashes of (seed, camera, image, pixel): the same for any order of pixels and number of threads.
+//! Random numbers are hashes of (seed, camera, image, pixel): they do not depend on the order of pixels or the number
+//! of threads.
 
 use std::sync::LazyLock;
 
 use vizflyt_protocol::random::{GOLDEN, mix};
 
-/// What the random numbers of one image are made from.
+/// Seed of the random numbers of one image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NoiseKey(u64);
 
 impl NoiseKey {
-    /// Makes the key of an image: `seq` counts the images of a camera of a flight.
+    /// Creates the key of an image; `seq` counts the images of a camera in a flight.
     pub fn new(seed: u64, camera: u64, seq: u64) -> Self {
         Self(mix(mix(mix(seed.wrapping_add(GOLDEN)) ^ camera).wrapping_add(GOLDEN) ^ seq))
     }
 
-    /// Returns one for another use of the same image.
+    /// Returns a key for another use in the same image.
     #[must_use]
     pub(super) fn stream(self, stream: u64) -> Self {
         Self(mix(self.0 ^ stream.wrapping_mul(GOLDEN)))
@@ -36,7 +39,7 @@ impl NoiseKey {
     }
 }
 
-/// Standard normal numbers, drawn from by bits.
+/// Table of standard normal numbers, indexed by random bits.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Normals(&'static [f32; NORMALS]);
 
@@ -49,32 +52,32 @@ impl Normals {
         Self(&TABLE)
     }
 
-    /// Returns the `n`-th of up to four normal numbers that 64 bits hold.
+    /// Returns the `n`-th of up to four normal numbers from 64 random bits.
     #[inline]
     pub(super) fn of(self, bits: u64, n: u32) -> f32 {
         self.0[(bits >> (16 * n)) as usize % NORMALS]
     }
 }
 
-/// What becomes of light between a pixel and a number.
+/// Conversion of light to a number of the converter.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Readout {
-    /// Electrons that a light of 1 makes in this exposure. [e]
+    /// Electrons of a light of 1 in this exposure. [e]
     pub electrons: f32,
-    /// Most electrons that a pixel holds. [e]
+    /// Full well capacity of a pixel. [e]
     pub full_well_e: f32,
-    /// Of reading a pixel, standard deviation. [e]
+    /// Read noise of a pixel, standard deviation. [e]
     pub read_noise_e: f32,
     /// Numbers of the converter per electron.
     pub numbers_per_e: f32,
-    /// The converter's greatest number.
+    /// Maximum number of the converter.
     pub full_scale: f32,
-    /// 1, or 0 for no noise.
+    /// 1, or 0 without noise.
     pub amount: f32,
 }
 
 impl Readout {
-    /// Returns what is read of a light, 0 to 1 of full scale; `normal` is a standard normal number.
+    /// Returns the digitised value of a light, 0 to 1 of full scale; `normal` is a standard normal number.
     #[inline]
     pub(super) fn read(&self, light: f32, normal: f32) -> f32 {
         let electrons = light * self.electrons;
@@ -84,7 +87,7 @@ impl Readout {
         number.clamp(0.0, self.full_scale) / self.full_scale
     }
 
-    /// Returns the standard deviation of what is read as `value`, 0 to 1.
+    /// Returns the standard deviation of a digitised `value`, 0 to 1.
     #[inline]
     pub(super) fn sigma(&self, value: f32) -> f32 {
         let per_e = self.numbers_per_e / self.full_scale;
@@ -104,7 +107,7 @@ fn quantile(p: f64) -> f64 {
     x
 }
 
-/// Numbers in the table: 16 kB, in the first cache; the last is 3.67 standard deviations out.
+/// Size of the table: 16 kB, within the L1 cache; the last number is at 3.67 standard deviations.
 const NORMALS: usize = 4096;
 
 #[cfg(test)]
@@ -119,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_is_normal() {
+    fn table_has_a_normal_distribution() {
         let table = Normals::table();
         let (mean, variance) = moments(table.0.iter().map(|&x| f64::from(x)));
         assert!(mean.abs() < 1e-6 && (variance - 1.0).abs() < 1e-3, "{mean} {variance}");
@@ -139,7 +142,7 @@ mod tests {
             });
             assert!(moments(both).0.abs() < 0.015);
         }
-        // Neighbours, and the numbers of one pixel.
+        // Neighbouring pixels, and the numbers of one pixel.
         let table = Normals::table();
         let neighbours = (0..100_000)
             .map(|n| f64::from(table.of(key.bits(n), 0)) * f64::from(table.of(key.bits(n + 1), 0)));
@@ -149,9 +152,9 @@ mod tests {
         assert!(moments(within).0.abs() < 0.015);
     }
 
-    /// The photon transfer curve of EMVA 1288: variance against mean is a line of slope K, offset by the dark noise.
+    /// Photon transfer curve of EMVA 1288: variance against mean is a line of slope K, offset by the dark noise.
     #[test]
-    fn photon_transfer_curve_is_that_of_emva_1288() {
+    fn photon_transfer_curve_follows_emva_1288() {
         let readout = Readout {
             electrons: 8000.0,
             full_well_e: 8180.0,
@@ -176,7 +179,7 @@ mod tests {
             let sigma = f64::from(readout.sigma((mean / 4095.0) as f32)) * 4095.0;
             assert!((sigma * sigma / expected - 1.0).abs() < 1e-2);
         }
-        // A full well holds no more, and the dark is not below 0.
+        // A full well is the maximum, and dark values are not below 0.
         assert!((readout.read(3.0, 0.0) * 4095.0 - (8180.0f32 * 0.47 + 0.5).floor()).abs() < 1e-2);
         assert_eq!(readout.read(0.0, -3.0), 0.0);
     }

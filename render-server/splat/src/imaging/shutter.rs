@@ -1,34 +1,37 @@
-//! The shutter: what each pixel sees while it is exposed, by the camera's path and by depth, from one rendered image.
+//! Shutter: light that each pixel collects during its exposure, computed from one rendered image with the camera's
+//! path and the depth.
 //!
-//! A row is exposed from one instant to another. Where the camera is at both is known; a pixel's point is where its depth says,
-//! so its path through the rendered image is known to first order, and the light along it is what the pixel collects. Rows that
-//! are exposed one after the other see the camera at their own instants: rolling shutter and motion blur are one thing.
+//! A row is exposed from one instant to another, and the camera's pose is known at both. The depth gives the point of
+//! a pixel, so the pixel's path through the rendered image is known to first order, and the light along this path is
+//! the light that the pixel collects. Rows that are exposed one after the other use the camera's pose at their own
+//! instants, which covers both rolling shutter and motion blur.
 //!
-//! Limits: what was hidden when the image was rendered is filled from beside it; what moves by itself stands still; the path is
-//! straight within one exposure. `film/tests.rs` of the scenes and `tests.rs` here hold it against every row rendered at its instants.
+//! Limits: areas that were hidden in the rendered image are filled from their neighbours; moving objects are treated
+//! as static; the path is straight within one exposure. `film/tests.rs` of the scenes and `tests.rs` here compare the
+//! result with renderings of every row at its instants.
 
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose};
 
-/// What is the same in every image of a lens.
+/// Values of a pixel that depend only on the lens.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pixel {
-    /// Slope of its ray in `cam`; NaN where the lens shows nothing.
+    /// Slope of its ray in `cam`; NaN if the lens does not image this pixel.
     slope: Vec2,
-    /// How far it moves when the slope does: columns of d(pixel) / d(slope). [px]
+    /// Derivative of the pixel by the slope: columns of d(pixel) / d(slope). [px]
     by_slope: [Vec2; 2],
 }
 
 impl Pixel {
-    /// Returns the slope `(x / z, y / z)` of its ray; NaN where the lens shows nothing. [cam]
+    /// Returns the slope `(x / z, y / z)` of its ray; NaN if the lens does not image this pixel. [cam]
     #[inline]
     pub fn slope(&self) -> Vec2 {
         self.slope
     }
 }
 
-/// Returns every pixel of a lens, row by row.
+/// Returns all pixels of a lens, row by row.
 pub fn pixels(k: &Intrinsics) -> Vec<Pixel> {
     let focal = DVec2::new(k.fx_px, k.fy_px);
     let at = |(x, y): (u32, u32)| {
@@ -42,7 +45,7 @@ pub fn pixels(k: &Intrinsics) -> Vec<Pixel> {
     all.into_par_iter().map(at).collect()
 }
 
-/// How a row's camera has moved from the one that was rendered.
+/// Movement of a row's camera relative to the rendered one.
 #[derive(Clone, Copy, Debug)]
 pub struct Moved {
     /// Rows of the rotation into the rendered camera.
@@ -51,9 +54,9 @@ pub struct Moved {
 }
 
 impl Moved {
-    /// Makes it of the row's camera in the rendered one.
+    /// Creates the movement from the pose of the row's camera in the rendered one.
     pub fn new(rendered_from_row: Pose<Cam, Cam>) -> Self {
-        // The transpose's columns are the rotation's rows.
+        // The columns of the transpose are the rows of the rotation.
         let back = rendered_from_row.rotation.conjugate();
         let row = |axis: DVec3| (back * axis).as_vec3();
         Self {
@@ -62,8 +65,8 @@ impl Moved {
         }
     }
 
-    /// Returns how far from a pixel its point is in the rendered image, if its depth is `1 / near`; to first order in the
-    /// lens's bend, within 0.02 px over 10 px. [px]
+    /// Returns the displacement of a pixel's point in the rendered image, if its depth is `1 / near`. To first order
+    /// in the lens distortion, within 0.02 px over 10 px. [px]
     #[inline]
     fn shift_px(&self, pixel: &Pixel, near: f32) -> Vec2 {
         let ray = pixel.slope.extend(1.0);
@@ -74,7 +77,7 @@ impl Moved {
     }
 }
 
-/// A rendered image in linear light, looked at by places of the image that is made; it may be larger by a margin.
+/// Rendered image in linear light, sampled at positions of the output image; it may be larger by a margin.
 #[derive(Clone, Copy, Debug)]
 pub struct Seen<'a> {
     light: &'a [f32],
@@ -85,11 +88,11 @@ pub struct Seen<'a> {
 }
 
 impl<'a> Seen<'a> {
-    /// Makes it of H x W x 3 linear light and H x W camera-z depths [m, cam], 0 where nothing is; `origin` is where the image's
-    /// upper left corner lies in it. [px]
+    /// Creates it from H x W x 3 linear light and H x W camera-z depths [m, cam], 0 without a surface.
+    /// `origin` is the position of the output image's upper left corner in it. [px]
     ///
     /// # Panics
-    /// If the slices are not of this size.
+    /// If the slices do not have this size.
     pub fn new(size: (u32, u32), light: &'a [f32], depth_m: &'a [f32], origin: Vec2) -> Self {
         let (width, height) = (size.0 as usize, size.1 as usize);
         assert_eq!(light.len(), 3 * width * height);
@@ -97,7 +100,7 @@ impl<'a> Seen<'a> {
         Self { light, depth_m, origin, width, height }
     }
 
-    /// Returns one over the depth at a place; 0 where nothing is. [1/m]
+    /// Returns the inverse depth at a position; 0 without a surface. [1/m]
     #[inline]
     fn nearness(&self, at: Vec2) -> f32 {
         let at = (at + self.origin).max(Vec2::ZERO);
@@ -106,7 +109,7 @@ impl<'a> Seen<'a> {
         if depth_m > 0.0 { 1.0 / depth_m } else { 0.0 }
     }
 
-    /// Returns the light at a place, interpolated between pixels' middles.
+    /// Returns the light at a position, interpolated between pixel centres.
     #[inline]
     fn light(&self, at: Vec2) -> Vec3 {
         let most = Vec2::new(self.width as f32 - 1.001, self.height as f32 - 1.001);
@@ -124,17 +127,17 @@ impl<'a> Seen<'a> {
         above + (below - above) * v
     }
 
-    /// Writes the light that row `y` collects into `line`, three values a pixel, if its camera moves from `moved[0]` to
-    /// `moved[1]` meanwhile. Where the lens shows nothing `line` is left as it is.
+    /// Writes the light that row `y` collects to `line`, three values per pixel, while its camera moves from
+    /// `moved[0]` to `moved[1]`. Pixels that the lens does not image are left unchanged.
     pub fn expose_row(&self, pixels: &[Pixel], y: usize, moved: [Moved; 2], line: &mut [f32]) {
         for (x, (pixel, light)) in pixels.iter().zip(line.chunks_exact_mut(3)).enumerate() {
-            // Where the lens shows nothing it stays dark.
+            // Pixels that the lens does not image stay dark.
             if !(pixel.slope.x.is_finite() && pixel.slope.y.is_finite()) {
                 continue;
             }
             let here = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
             let ends = |near: f32| moved.map(|moved| here + moved.shift_px(pixel, near));
-            // The depth of what the pixel sees, not of what stood there when the image was rendered.
+            // Depth of the point that the pixel sees, not of the point at the same place in the rendered image.
             let [a, b] = ends(self.nearness(here));
             let [a, b] = ends(self.nearness((a + b) * 0.5));
             let samples = (b - a).length().ceil().clamp(1.0, MOST_SAMPLES);
@@ -148,5 +151,6 @@ impl<'a> Seen<'a> {
     }
 }
 
-/// More than a fast turn needs: one a pixel. A longer path is sampled more sparsely.
+/// Maximum number of samples: one per pixel of path, more than a fast rotation needs. Longer paths are sampled more
+/// sparsely.
 const MOST_SAMPLES: f32 = 16.0;

@@ -1,20 +1,24 @@
-//! Depth by a stereo pair, as an Intel RealSense D435 gives it.
+//! Depth of a stereo pair, like that of an Intel RealSense D435.
 //!
-//! The image is the left camera's, which depth belongs to; the right one is a baseline to the right. Of a point at depth `z` the
-//! disparity is `d = f B / z`. What the pair measures differs from the truth by:
+//! The image and its depth are those of the left camera; the right one is a baseline to the right. For a point at
+//! depth `z`, the disparity is `d = f B / z`. The measured depth differs from the truth by:
 //!
-//! - **noise**: disparities are good to a part of a pixel, so depth is to `sigma_z = z^2 sigma_d / (f B)` (Intel, "Tuning depth
-//!   cameras for best performance", dev.intelrealsense.com: a well tuned camera has `sigma_d` below 0.1 px, 0.08 are usual);
-//! - **steps**: disparities are 32nds of a pixel, depth whole millimetres (z16);
-//! - **shadow**: what the right camera does not see, as something nearer hides it: a strip on the left of whatever is in front,
-//!   `f B (1/near - 1/far)` wide, and the left border's `f B / z`, which lies outside the right image;
-//! - **range**: at most `most_disparity_px` are searched, 126 for a D435: nothing nearer than `f B / 126`;
-//! - **fattening**: a window is matched as a whole, so what is in front reaches over what is behind by about half of it (D.
-//!   Scharstein, R. Szeliski, IJCV 2002, section 3.2);
-//! - **holes**, if there is no projector: where the image has no texture to match.
+//! - **noise**: the error of a disparity is a fraction of a pixel, so that of depth is
+//!   `sigma_z = z^2 sigma_d / (f B)` (Intel, "Tuning depth cameras for best performance", dev.intelrealsense.com:
+//!   a well tuned camera has `sigma_d` below 0.1 px, usually 0.08);
+//! - **steps**: disparities are 32nds of a pixel, depths whole millimetres (z16);
+//! - **shadow**: areas hidden from the right camera by something nearer have no depth: a strip of width
+//!   `f B (1/near - 1/far)` on the left of each foreground object, and a strip of width `f B / z` at the left border,
+//!   which is outside the right image;
+//! - **range**: at most `most_disparity_px` are searched, 126 for a D435, so nothing nearer than `f B / 126` is
+//!   measured;
+//! - **fattening**: a window is matched as a whole, so the foreground extends over the background by about half of it
+//!   (D. Scharstein, R. Szeliski, IJCV 2002, section 3.2);
+//! - **holes** without a projector: areas without texture cannot be matched.
 //!
-//! `f` is the focal length at which the pair matches, not that of the rendered image. Not modelled: noise that neighbours share,
-//! rows that are not rectified (the lens of the rendered image should be a pinhole), the projector's reach, repeated textures.
+//! `f` is the focal length of the matched images, not that of the rendered image. Not modelled: correlated noise of
+//! neighbours, unrectified rows (the lens of the rendered image should be a pinhole), the range of the projector,
+//! repeated textures.
 
 use rayon::prelude::*;
 use vizflyt_protocol::geometry::Intrinsics;
@@ -23,38 +27,39 @@ use super::noise::{NoiseKey, Normals};
 use super::tone::luminance;
 use crate::RgbdImage;
 
-/// A stereo pair that matches.
+/// Stereo pair with its matching parameters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Stereo {
-    /// Between the two cameras. [m]
+    /// Distance between the two cameras. [m]
     pub baseline_m: f64,
-    /// Focal length of the images that are matched. [px]
+    /// Focal length of the matched images. [px]
     pub focal_px: f64,
     /// Standard deviation of a disparity. [px]
     pub subpixel_px: f64,
-    /// Greatest disparity that is searched. [px]
+    /// Maximum disparity that is searched. [px]
     pub most_disparity_px: f64,
-    /// Nothing further is reported. [m]
+    /// Maximum reported depth. [m]
     pub most_m: f64,
-    /// How far what is in front reaches over what is behind, in images that are matched. [px]
+    /// Extension of the foreground over the background, in pixels of the matched images. [px]
     pub fattening_px: f64,
-    /// Least difference of the luminance within 3 x 3 pixels that can be matched, of the brightest; 0 with a projector.
+    /// Minimum difference of the luminance within 3 x 3 pixels for a match, relative to the brightest; 0 with a
+    /// projector.
     pub least_texture: f64,
 }
 
-/// Buffers.
+/// Buffers, reused for the next image.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
-    /// Disparities in pixels of the rendered image; 0 is none.
+    /// Disparities in pixels of the rendered image; 0 means no disparity.
     disparity: Vec<f32>,
-    /// The greatest within a row's window.
+    /// Maximum within a row's window.
     across: Vec<f32>,
-    /// The nearest that each place of the right image sees.
+    /// Disparity of the nearest surface at each pixel of the right image.
     right: Vec<f32>,
 }
 
 impl Stereo {
-    /// Returns the depth that the greatest disparity is of. [m]
+    /// Returns the minimum depth, at the maximum disparity. [m]
     pub fn least_m(&self) -> f64 {
         self.focal_px * self.baseline_m / self.most_disparity_px
     }
@@ -64,7 +69,7 @@ impl Stereo {
         depth_m * depth_m * self.subpixel_px / (self.focal_px * self.baseline_m)
     }
 
-    /// Measures into `out`, H x W, 0 where nothing is: camera-z depths in whole millimetres. [m, cam]
+    /// Measures camera-z depths in whole millimetres into `out`, H x W; 0 means no return. [m, cam]
     pub(super) fn measure(
         &self,
         k: &Intrinsics,
@@ -80,10 +85,10 @@ impl Stereo {
             buffer.resize(count, 0.0);
         }
         let Scratch { disparity, across, right } = scratch;
-        // Of the rendered image: disparity times depth.
+        // Product of disparity and depth in the rendered image.
         let product = (k.fx_px * self.baseline_m) as f32;
         let reach = (self.fattening_px * k.fx_px / self.focal_px).round() as usize;
-        // What is in front is one by more than noise and slopes make.
+        // A pixel is in the foreground if its disparity is greater by more than noise and slopes cause.
         let jump = |d: f32| 1.05 * d;
 
         let rows = disparity.par_chunks_mut(width).zip(right.par_chunks_mut(width));
@@ -130,7 +135,7 @@ impl Stereo {
         });
     }
 
-    /// Returns what is measured of one over a depth; 0 out of range. [m]
+    /// Returns the measured depth for the inverse depth `near`; 0 if out of range. [m]
     fn depth_m(&self, near: f64, normal: f32) -> f32 {
         let product = self.focal_px * self.baseline_m;
         let disparity = product * near + self.subpixel_px * f64::from(normal);
@@ -143,13 +148,13 @@ impl Stereo {
     }
 }
 
-/// Puts the nearest of a row into each place of the right camera's row.
+/// Writes the disparity of the nearest surface to each pixel of the right camera's row.
 fn see_from_the_right(disparity: &[f32], right: &mut [f32]) {
     right.fill(0.0);
     for (x, &d) in disparity.iter().enumerate() {
         let at = x as f32 - d;
         if d > 0.0 && at >= 0.0 {
-            // A pixel covers parts of two.
+            // A pixel overlaps two pixels.
             for at in [at as usize, at as usize + 1] {
                 if let Some(nearest) = right.get_mut(at) {
                     *nearest = nearest.max(d);
@@ -159,14 +164,15 @@ fn see_from_the_right(disparity: &[f32], right: &mut [f32]) {
     }
 }
 
-/// Whether the right camera sees what a pixel does: nothing that is nearer by more than a neighbour may be lies before it.
+/// Returns whether the right camera sees the point of a pixel: no surface is in front of it that is nearer by more
+/// than a neighbour's difference.
 #[inline]
 fn is_seen_from_the_right(d: f32, x: usize, right: &[f32]) -> bool {
     let at = x as f32 - d + 0.5;
     d > 0.0 && at >= 0.5 && right[(at as usize).min(right.len() - 1)] <= d * 1.05 + 0.5
 }
 
-/// Returns how much the luminance differs around a pixel, of the brightest.
+/// Returns the range of the luminance around a pixel, relative to the brightest.
 fn texture(light: &[f32], (width, height): (usize, usize), (x, y): (usize, usize)) -> f32 {
     let (mut low, mut high) = (f32::INFINITY, 0f32);
     for y in y.saturating_sub(1)..height.min(y + 2) {
@@ -180,14 +186,14 @@ fn texture(light: &[f32], (width, height): (usize, usize), (x, y): (usize, usize
     (high - low) / high.max(1e-6)
 }
 
-/// Steps of a disparity within a pixel (Intel, "Subpixel linearity improvement", dev.intelrealsense.com).
+/// Steps of a disparity per pixel (Intel, "Subpixel linearity improvement", dev.intelrealsense.com).
 const STEPS: f64 = 32.0;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// At 848 x 480, 87 degrees.
+    /// D435 at 848 x 480, 87 degrees.
     const D435: Stereo = Stereo {
         baseline_m: 0.05,
         focal_px: 446.8,
@@ -218,7 +224,7 @@ mod tests {
         (k, out)
     }
 
-    /// Intel's curve: the depth's deviation grows with its square.
+    /// Intel's curve: the standard deviation of depth grows with its square.
     #[test]
     fn noise_grows_with_the_square_of_depth() {
         for z in [0.5f64, 1.0, 2.0, 4.0] {
@@ -227,7 +233,7 @@ mod tests {
             let mean = kept.iter().sum::<f64>() / kept.len() as f64;
             let variance = kept.iter().map(|z| (z - mean).powi(2)).sum::<f64>() / kept.len() as f64;
             let expected_m = z * z * 0.08 / (446.8 * 0.05);
-            // Steps of a 32nd of a pixel and of a millimetre add about their twelfths.
+            // Quantisation to a 32nd of a pixel and to a millimetre adds a twelfth of each squared step.
             let step_m = z * z / 32.0 / (446.8 * 0.05);
             let all = (expected_m.powi(2) + (step_m.powi(2) + 1e-6) / 12.0).sqrt();
             assert!((variance.sqrt() / all - 1.0).abs() < 0.05, "{z} m: {}", variance.sqrt());
@@ -237,13 +243,14 @@ mod tests {
     }
 
     #[test]
-    fn range_and_the_left_border_are_where_the_disparity_says() {
+    fn range_and_left_border_follow_from_the_disparity() {
         assert!((D435.least_m() - 0.1773).abs() < 1e-4);
         assert!(measured(&NO_NOISE, (64, 8), |_, _| 0.17).1.iter().all(|&z| z == 0.0));
         assert!(measured(&NO_NOISE, (64, 8), |_, _| 11.0).1.iter().all(|&z| z == 0.0));
         let (k, out) = measured(&NO_NOISE, (320, 8), |_, _| 0.8);
         let lost = out[4 * 320..][..320].iter().take_while(|&&z| z == 0.0).count();
-        // The invalid band of the data sheet: baseline over twice the depth and the half angle's tangent, of the width.
+        // Invalid depth band of the data sheet: share of the width, baseline over twice the depth and the tangent of
+        // the half angle.
         let band = 0.05 / (2.0 * 0.8 * libm::tan(43.5f64.to_radians())) * 320.0;
         assert!((lost as f64 - band).abs() <= 1.0, "{lost} px, not {band}");
         assert!((band - k.fx_px * 0.05 / 0.8).abs() < 1e-9);
@@ -251,8 +258,8 @@ mod tests {
     }
 
     #[test]
-    fn shadow_lies_on_the_left_of_what_is_in_front() {
-        // A board 1 m ahead, columns 150 to 249, before a wall 4 m ahead.
+    fn shadow_is_on_the_left_of_the_foreground() {
+        // A board 1 m ahead, columns 150 to 249, in front of a wall 4 m ahead.
         let board = |x: usize, _: usize| if (150..250).contains(&x) { 1.0 } else { 4.0 };
         let (k, out) = measured(&NO_NOISE, (640, 8), board);
         let row = &out[4 * 640..][..640];
@@ -261,7 +268,7 @@ mod tests {
         assert!((shadow as f64 - width_px).abs() <= 1.5, "{shadow} px, not {width_px}");
         assert!(row[150..250].iter().all(|&z| (z - 1.0).abs() < 0.005));
         assert!(row[250..].iter().all(|&z| (z - 4.0).abs() < 0.05), "none on the right");
-        // What is behind a pole is seen on its other side: the shadow is as wide as the pole.
+        // The background of a pole is visible on its other side: the shadow is as wide as the pole.
         let pole = |x: usize, _: usize| if (300..308).contains(&x) { 1.0 } else { 4.0 };
         let (_, out) = measured(&NO_NOISE, (640, 8), pole);
         let dark = out[4 * 640 + 20..][..620].iter().filter(|&&z| z == 0.0).count();
@@ -278,9 +285,9 @@ mod tests {
     }
 
     #[test]
-    fn edges_are_fattened_by_their_window_and_blank_walls_have_holes() {
+    fn fattens_edges_and_leaves_holes_in_textureless_walls() {
         let board = |x: usize, _: usize| if (150..250).contains(&x) { 1.0 } else { 4.0 };
-        // Rendered at the focal length of the match, pixels are the same.
+        // Rendered at the focal length of the matched images, so that pixels are equal.
         let fat = Stereo { fattening_px: 3.0, ..NO_NOISE };
         let (_, out) = measured(&fat, (848, 8), board);
         let near = out[4 * 848..][..848].iter().filter(|&&z| (z - 1.0).abs() < 0.01).count();

@@ -1,11 +1,11 @@
-//! The whole of it, against formulas and against images that are rendered at every instant of every row.
+//! Tests of the complete imager, against formulas and against images that are rendered at every instant of every row.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 
 use super::*;
 use crate::{CpuRenderer, Rasterizer, Splats};
 
-/// A sensor without faults, 1000 e at full scale.
+/// Sensor without noise and filters, 1000 e at full scale.
 const IDEAL: Sensor = Sensor {
     full_well_e: 1000.0,
     read_noise_e: 0.0,
@@ -49,7 +49,7 @@ fn take(model: &CameraModel, camera: &Camera, path: &Path<'_>, mut image: RgbdIm
 }
 
 #[test]
-fn a_perfect_camera_changes_nothing_and_an_ideal_sensor_only_rounds() {
+fn perfect_camera_changes_nothing_and_ideal_sensor_only_rounds() {
     let k = lens(32, 24);
     let camera = Camera::new(k, Pose::IDENTITY, 0.01);
     let mut image = flat(&k, 0.3, 2.0);
@@ -66,7 +66,7 @@ fn a_perfect_camera_changes_nothing_and_an_ideal_sensor_only_rounds() {
     assert_eq!((taken.depth_median_m, taken.ids), (image.depth_median_m, image.ids));
 }
 
-/// Linear light of the first channel.
+/// Returns the linear light of the first channel.
 fn linear(image: &RgbdImage, n: usize) -> f64 {
     f64::from(tone().linear(image.rgb[3 * n]))
 }
@@ -94,7 +94,7 @@ fn exposure_gain_and_vignette_multiply() {
     assert!((linear(&dark, 0) - expected).abs() < 0.004, "{}", linear(&dark, 0));
 }
 
-/// A wall 2 m ahead, black on the left of x = 0 and white on the right.
+/// Renders a wall 2 m ahead, black on the left of x = 0 and white on the right.
 fn stripe_edge(k: &Intrinsics, world_from_cam: &Pose<World, Cam>) -> RgbdImage {
     let mut image = flat(k, 0.0, 2.0);
     for y in 0..k.height_px {
@@ -112,9 +112,9 @@ fn stripe_edge(k: &Intrinsics, world_from_cam: &Pose<World, Cam>) -> RgbdImage {
     image
 }
 
-/// Blur is as long as the image moves while a row is exposed: `omega f t`.
+/// Length of the blur: movement of the image during the exposure of a row, `omega f t`.
 #[test]
-fn blur_is_as_long_as_the_turn_during_the_exposure() {
+fn blur_length_equals_the_rotation_during_the_exposure() {
     let k = lens(320, 240);
     for (omega_radps, shutter_s) in [(2.0f64, 0.01), (1.0, 0.02), (-2.0, 0.03)] {
         let path = move |at_s: f64| -> Pose<World, Cam> {
@@ -129,7 +129,7 @@ fn blur_is_as_long_as_the_turn_during_the_exposure() {
             &path,
             stripe_edge(&k, &camera.world_from_cam),
         );
-        // An edge that moves evenly over L pixels becomes a ramp of L: its slope's second moment is L^2 / 12.
+        // An edge that moves evenly over L pixels becomes a ramp of L: the second moment of its slope is L^2 / 12.
         let row: Vec<f64> = (0..320).map(|x| linear(&taken, 120 * 320 + x)).collect();
         let steps: Vec<f64> = row.windows(2).map(|pair| pair[1] - pair[0]).collect();
         let total: f64 = steps.iter().sum();
@@ -137,7 +137,7 @@ fn blur_is_as_long_as_the_turn_during_the_exposure() {
             let terms = steps.iter().enumerate().map(|(x, d)| d * (x as f64 - middle).powi(power));
             terms.sum::<f64>() / total
         };
-        // Interpolation between pixels, and their differences, add a pixel each.
+        // Interpolation between pixels, and the differences, add a pixel each.
         let found_px = (12.0 * at(2, at(1, 0.0)) - 2.0).sqrt();
         let expected_px = (omega_radps * k.fx_px * shutter_s).abs();
         assert!((total - 1.0).abs() < 0.02, "the ramp is whole: {total}");
@@ -145,9 +145,9 @@ fn blur_is_as_long_as_the_turn_during_the_exposure() {
     }
 }
 
-/// Rows are exposed one after the other: an upright edge is sheared by `omega f` times each row's instant.
+/// Rows are exposed one after the other: a vertical edge is sheared by `omega f` times each row's instant.
 #[test]
-fn rolling_shutter_shears_by_each_rows_instant() {
+fn rolling_shutter_shears_by_the_instant_of_each_row() {
     let k = lens(320, 240);
     let (omega_radps, readout_s) = (0.8, 0.03);
     let path = |at_s: f64| -> Pose<World, Cam> {
@@ -164,7 +164,7 @@ fn rolling_shutter_shears_by_each_rows_instant() {
     let global = take(&model(Sensor { readout_s: 0.0, ..rolling }), &camera, &path, image);
     for y in [5usize, 60, 120, 180, 235] {
         let row_s = ((y as f64 + 0.5) / 240.0 - 0.5) * readout_s;
-        // Turning to the right moves the edge to the left.
+        // Rotation to the right moves the edge to the left.
         let moved_px = -k.fx_px * libm::tan(omega_radps * row_s);
         let found_px = edge_px(&taken, y) - edge_px(&global, 120);
         assert!((found_px - moved_px).abs() < 0.6, "row {y}: {found_px} px, not {moved_px} px");
@@ -172,8 +172,8 @@ fn rolling_shutter_shears_by_each_rows_instant() {
     }
 }
 
-/// Balls at several depths before a wall of them. Those of the wall stand one behind the other, and differ little in colour: which of
-/// two that overlap is in front must not turn with the camera.
+/// Returns balls at several depths in front of a wall of splats. Those of the wall are at different depths, and have
+/// similar colours, because rotation of the camera must not change which of two overlapping splats is visible.
 fn balls() -> Splats {
     let mut splats = Splats::default();
     for i in 0..8000u32 {
@@ -196,15 +196,15 @@ fn alike_db(a: &[u8], b: &[u8]) -> f64 {
     10.0 * libm::log10(255.0 * 255.0 * a.len() as f64 / sum.max(1e-9))
 }
 
-/// From one image, against each row rendered at eight instants of its own exposure: turning, and flying past balls, behind whose
-/// edges there was nothing to see.
+/// Compares the result from one image with rows that are each rendered at eight instants of their own exposure:
+/// rotating, and passing balls that hide the background.
 #[test]
-fn rows_and_blur_are_those_of_every_instant_rendered() {
+fn rolling_shutter_and_blur_match_renderings_of_every_instant() {
     let k = lens(160, 120);
     let (width, height) = (160usize, 120usize);
     let splats = balls();
     let mut renderer = CpuRenderer::new(&splats);
-    // A row begins every third of a millisecond and is exposed for 64 of them, so that rows share instants.
+    // A row begins every third of a millisecond and is exposed for 64 times that, so that rows share instants.
     let row_s = 0.04 / height as f64;
     let shutter_s = 64.0 * row_s;
     let exposure = ExposureControl::Fixed(Exposure { shutter_s, gain: 1.0 });
@@ -224,7 +224,7 @@ fn rows_and_blur_are_those_of_every_instant_rendered() {
         };
         let (camera, image) = render(0.0);
         let taken = take(&model(sensor), &camera, &path, image.clone());
-        // Row y's n-th instant is the (y + 8 n)-th of all.
+        // The n-th instant of row y is the (y + 8 n)-th of all.
         let mut sum = vec![0f32; 3 * width * height];
         for instant in 0..height + 56 {
             let at_s = (instant as f64 + 0.5 - 28.0 - 0.5 * height as f64) * row_s;
@@ -246,9 +246,9 @@ fn rows_and_blur_are_those_of_every_instant_rendered() {
     }
 }
 
-/// The same bits on one thread and on four; another image's noise is another.
+/// Results are bit-identical on one thread and on four; noise differs between images.
 #[test]
-fn images_are_the_same_on_any_number_of_threads() {
+fn images_do_not_depend_on_the_number_of_threads() {
     let k = Intrinsics { width_px: 75, height_px: 51, ..lens(75, 51) };
     let path = |at_s: f64| -> Pose<World, Cam> {
         Pose::new(DVec3::X * at_s, DQuat::from_rotation_y(0.9 * at_s))
@@ -307,7 +307,7 @@ fn images_are_the_same_on_any_number_of_threads() {
 }
 
 #[test]
-fn poison_comes_out_clean() {
+fn nan_and_infinity_become_valid_colours_and_depths() {
     let k = lens(16, 12);
     let camera = Camera::new(k, Pose::IDENTITY, 0.01);
     let path = |at_s: f64| -> Pose<World, Cam> {
@@ -363,7 +363,7 @@ fn poison_comes_out_clean() {
 }
 
 #[test]
-fn automatic_exposure_goes_on_from_image_to_image() {
+fn automatic_exposure_keeps_its_state_between_images() {
     let k = lens(32, 24);
     let camera = Camera::new(k, Pose::IDENTITY, 0.01);
     let auto = ExposureControl::Auto {
@@ -383,7 +383,7 @@ fn automatic_exposure_goes_on_from_image_to_image() {
         linear(&image, 0)
     };
     assert!((at(100.0, 0.5) - 0.2).abs() < 0.003, "the first is right");
-    // Light falls to a quarter: two stops, half a second later 1 - 1/e of them are made up.
+    // Light falls to a quarter: two stops; half a second later, 1 - 1/e of them are compensated.
     let quarter = f32::from(tone().shown(0.25 * tone().linear(0.5))) / 255.0;
     let expected = 0.2 * libm::exp2(-2.0 * libm::exp(-1.0));
     let found = at(100.5, quarter);

@@ -1,20 +1,23 @@
-//! Depth by the time that light takes: a continuous-wave camera, whose light is modulated and whose pixels measure the phase.
+//! Depth by time of flight: a continuous-wave camera with modulated light, whose pixels measure the phase.
 //!
-//! Light of modulation `f` comes back from a distance `d` (along the ray) with the phase `4 pi f d / c`. A pixel has collected
-//! `n = signal_e_1m reflectivity / d^2` electrons of it in four buckets, and `background_e` of other light. By the photons' noise in
-//! the buckets (R. Lange, P. Seitz, IEEE J. Quantum Electronics 37, 2001, section III, written per electron):
+//! Light of modulation `f` returns from a distance `d` (along the ray) with the phase `4 pi f d / c`. A pixel
+//! collects `n = signal_e_1m reflectivity / d^2` electrons of it in four buckets, and `background_e` of other light.
+//! Photon noise in the buckets gives (R. Lange, P. Seitz, IEEE J. Quantum Electronics 37, 2001, section III, written
+//! per electron):
 //!
 //! ```text
 //! sigma_d = c / (4 pi f) * sqrt(2 (n + background)) / (contrast n)
 //! ```
-//! - **aliasing**: phases repeat, so `d` and `d + c / (2 f)` are the same. A camera of several frequencies repeats at their beat's.
-//! - **range**: what is outside of it is no return, as is what has too little signal.
-//! - **several ways**: light also comes by way of other surfaces, longer and with another phase; the phasors add up, and a corner
-//!   looks further away and rounder (S. Fuchs, ICPR 2010). Here the ways with one bounce are summed, between diffuse surfaces that the
-//!   camera sees itself, on a coarse grid of them; the light's rest is interpolated over surfaces. Not modelled: more bounces,
-//!   what the camera does not see, light scattered within the lens, motion between the buckets.
+//! - **aliasing**: phases repeat, so `d` and `d + c / (2 f)` are the same. With several frequencies, distances repeat
+//!   at their beat frequency.
+//! - **range**: distances outside of it, and pixels with too little signal, give no return.
+//! - **multipath**: light also arrives from other surfaces, on a longer path and with another phase. The phasors add
+//!   up, and a corner appears further away and rounder (S. Fuchs, ICPR 2010). Paths with one bounce are summed,
+//!   between diffuse surfaces that the camera sees, on a coarse grid; the result is interpolated over surfaces. Not
+//!   modelled: more bounces, surfaces outside of the image, light scattered within the lens, motion between the
+//!   buckets.
 //!
-//! The reflectivity is the luminance of the colour image, which is not that in the infrared.
+//! The reflectivity is the luminance of the colour image, which differs from that in the infrared.
 
 use core::f32::consts::PI;
 
@@ -27,57 +30,57 @@ use super::shutter::Pixel;
 use super::tone::luminance;
 use crate::RgbdImage;
 
-/// A time-of-flight camera.
+/// Time-of-flight camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tof {
-    /// Modulation that the noise is of: the highest. [Hz]
+    /// Modulation frequency that determines the noise: the highest one. [Hz]
     pub modulation_hz: f64,
-    /// Distance from which on distances repeat; `c / (2 f)` of one frequency. [m]
+    /// Unambiguous range, after which distances repeat; `c / (2 f)` for one frequency. [m]
     pub unambiguous_m: f64,
-    /// Nothing nearer is reported. [m]
+    /// Minimum reported distance. [m]
     pub least_m: f64,
-    /// Nothing further is reported. [m]
+    /// Maximum reported distance. [m]
     pub most_m: f64,
-    /// Electrons of its own light that a white wall 1 m ahead makes in an image. [e]
+    /// Electrons per image from the camera's light for a white wall 1 m ahead. [e]
     pub signal_e_1m: f64,
-    /// Electrons of other light. [e]
+    /// Electrons from other light. [e]
     pub background_e: f64,
-    /// How much of the modulation is left in the buckets, 0 to 1.
+    /// Share of the modulation that is left in the buckets, 0 to 1.
     pub contrast: f64,
-    /// Pixels with fewer electrons of signal are no return. [e]
+    /// Minimum signal of a return. [e]
     pub least_signal_e: f64,
-    /// Whether light that comes by other surfaces counts.
+    /// Whether light from other surfaces is modelled (multipath).
     pub multipath: bool,
 }
 
 /// Speed of light. [m/s]
 pub const LIGHT_MPS: f64 = 299_792_458.0;
 
-/// One place of the coarse grid.
+/// Cell of the coarse grid.
 #[derive(Clone, Copy, Debug, Default)]
 struct Patch {
-    /// Where it is; all zero where nothing is. [m, cam]
+    /// Position; all zero without a surface. [m, cam]
     p_m: Vec3,
-    /// Towards the camera's side.
+    /// Normal, towards the camera.
     normal: Vec3,
-    /// Reflectivity times the light that falls onto it, times its area. [m^2/m^2]
+    /// Reflectivity times incident light, times area. [m^2/m^2]
     sent: f32,
-    /// Its area over pi, which bounds its nearness. [m^2]
+    /// Area divided by pi, which limits the form factor at short distance. [m^2]
     area_by_pi_m2: f32,
     /// Distance from the camera. [m]
     distance_m: f32,
 }
 
-/// Buffers.
+/// Buffers, reused for the next image.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
     patches: Vec<Patch>,
-    /// Light by other ways at each patch, of its direct one, turned back by its own phase.
+    /// Indirect light at each patch, relative to its direct light and phase.
     indirect: Vec<Vec2>,
 }
 
 impl Tof {
-    /// Returns the electrons of signal of a reflectivity, 0 to 1, seen at right angles. [e]
+    /// Returns the electrons of signal for a reflectivity, 0 to 1, at normal incidence. [e]
     pub fn signal_e(&self, reflectivity: f64, distance_m: f64) -> f64 {
         self.signal_e_1m * reflectivity / (distance_m * distance_m)
     }
@@ -92,7 +95,7 @@ impl Tof {
         LIGHT_MPS / (4.0 * core::f64::consts::PI * self.modulation_hz)
     }
 
-    /// Measures into `out`, H x W, 0 where nothing is: camera-z depths in whole millimetres. [m, cam]
+    /// Measures camera-z depths in whole millimetres into `out`, H x W; 0 means no return. [m, cam]
     pub(super) fn measure(
         &self,
         k: &Intrinsics,
@@ -143,13 +146,13 @@ impl Tof {
         });
     }
 
-    /// Returns what is measured of a distance; 0 is no return. [m]
+    /// Returns the measured value of a distance; 0 without a return. [m]
     fn distance_m(&self, true_m: f32, reflectivity: f32, other: Vec2, normals: Vec2) -> f32 {
         let signal_e = self.signal_e(f64::from(reflectivity), f64::from(true_m)) as f32;
         if !(signal_e >= self.least_signal_e as f32) {
             return 0.0;
         }
-        // The phasor, turned back by the true phase, of the direct light's length.
+        // Phasor relative to the length and the true phase of the direct light.
         let noise_e = (2.0 * (signal_e + self.background_e as f32)).sqrt();
         let phasor = Vec2::X + other + normals * (noise_e / (self.contrast as f32 * signal_e));
         let off_m = libm::atan2f(phasor.y, phasor.x) * self.metres_per_rad() as f32;
@@ -159,7 +162,7 @@ impl Tof {
     }
 }
 
-/// Returns the light that a patch gets from all others, of what it gets from the camera, by phase.
+/// Returns the light at a patch from all others, relative to its light from the camera, by phase.
 fn collect(at: &Patch, patches: &[Patch], metres_per_rad: f32) -> Vec2 {
     if at.distance_m <= 0.0 {
         return Vec2::ZERO;
@@ -170,14 +173,14 @@ fn collect(at: &Patch, patches: &[Patch], metres_per_rad: f32) -> Vec2 {
     for from in patches {
         let way = from.p_m - at.p_m;
         let square_m2 = way.length_squared();
-        // Both look at each other; none looks at itself.
+        // Both must face each other; a patch does not face itself.
         let (here, there) = (at.normal.dot(way), -from.normal.dot(way));
         if !(from.sent > 0.0 && here > 0.0 && there > 0.0 && square_m2 > 1e-8) {
             continue;
         }
-        // A disc's form factor, which stays bounded close by.
+        // Form factor of a disc, which is bounded at short distance.
         let form = here * there / (square_m2 * PI * (square_m2 + from.area_by_pi_m2));
-        // The way's rest over the direct one: there and back, halved.
+        // Extra length of the path compared with the direct one: there and back, halved.
         let longer_m = 0.5 * (from.distance_m + square_m2.sqrt() - at.distance_m);
         let (sin, cos) = libm::sincosf(longer_m / metres_per_rad);
         sum += Vec2::new(cos, sin) * (from.sent * form);
@@ -185,7 +188,7 @@ fn collect(at: &Patch, patches: &[Patch], metres_per_rad: f32) -> Vec2 {
     sum / direct
 }
 
-/// The coarse grid of an image.
+/// Coarse grid of an image.
 struct Grid {
     step: usize,
     columns: usize,
@@ -199,7 +202,7 @@ impl Grid {
         Self { step, columns: width.div_ceil(step), rows: height.div_ceil(step) }
     }
 
-    /// Returns the indirect light at a pixel: of the four patches around it, those of its own surface.
+    /// Returns the indirect light at a pixel, from those of the four surrounding patches that are on its own surface.
     fn at(
         &self,
         patches: &[Patch],
@@ -237,7 +240,7 @@ impl Grid {
     }
 }
 
-/// What patches are cut from.
+/// Image from which patches are computed.
 struct View<'a> {
     image: &'a RgbdImage,
     pixels: &'a [Pixel],
@@ -247,7 +250,7 @@ struct View<'a> {
 }
 
 impl View<'_> {
-    /// Returns the point that a pixel sees. [m, cam]
+    /// Returns the point of a pixel. [m, cam]
     fn point(&self, x: usize, y: usize) -> Option<Vec3> {
         let n = y * self.width + x;
         let (z, slope) = (self.image.depth_median_m[n], self.pixels[n].slope());
@@ -264,7 +267,7 @@ impl View<'_> {
     fn patch_at(&self, step: usize, x: usize, y: usize) -> Option<Patch> {
         let p_m = self.point(x, y)?;
         let distance_m = p_m.length();
-        // Of each two neighbours the one that is of the same surface.
+        // Of each two neighbours, the one on the same surface.
         let beside = |low: (usize, usize), high: (usize, usize)| {
             let ends = [low, high].map(|(x, y)| self.point(x, y).map(|p| p - p_m));
             let [low, high] = ends.map(|d| d.filter(|d| d.length_squared() > 0.0));
@@ -291,11 +294,12 @@ impl View<'_> {
     }
 }
 
-/// Patches along the longer side: 24 x 18 of a usual image, 190 000 ways. A corner's error is within 15 % of what is summed finely.
+/// Patches along the longer side: 24 x 18 for a usual image, 190 000 paths. The error in a corner is within 15 % of
+/// the fine sum.
 const PATCHES: usize = 24;
-/// Black is not quite black in the infrared.
+/// Minimum reflectivity: black is not completely black in the infrared.
 const LEAST_REFLECTIVITY: f32 = 0.02;
-/// Surfaces seen at less than 3 degrees have no direct light to speak of.
+/// Minimum cosine: surfaces seen at less than 3 degrees have almost no direct light.
 const LEAST_COSINE: f32 = 0.05;
 
 #[cfg(test)]

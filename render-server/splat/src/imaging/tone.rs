@@ -1,11 +1,11 @@
-//! Display colours and linear light, by tables (sRGB, IEC 61966-2-1).
+//! Conversion between display colours and linear light by tables (sRGB, IEC 61966-2-1).
 
-/// Both directions.
+/// Tables of both directions.
 #[derive(Debug)]
 pub struct Tone {
-    /// Linear light of `n / LINEAR` of a display colour.
+    /// Linear light of the display colour `n / LINEAR`.
     linear: Vec<f32>,
-    /// Display colour of `n / SHOWN` of linear light.
+    /// Display colour of the linear light `n / SHOWN`.
     shown: Vec<u8>,
 }
 
@@ -21,7 +21,7 @@ impl Default for Tone {
 }
 
 impl Tone {
-    /// Returns the linear light of a display colour; what is outside 0 to 1 is cut.
+    /// Returns the linear light of a display colour, clamped to 0 to 1.
     #[expect(clippy::manual_clamp, reason = "NaN becomes 0")]
     #[inline]
     pub fn linear(&self, shown: f32) -> f32 {
@@ -31,7 +31,7 @@ impl Tone {
         low + (high - low) * (at - n as f32)
     }
 
-    /// Returns the display colour of linear light; what is outside 0 to 1 is cut, as a full sensor does.
+    /// Returns the display colour of linear light, clamped to 0 to 1 like a full sensor.
     #[expect(clippy::manual_clamp, reason = "NaN becomes 0")]
     #[inline]
     pub fn shown(&self, linear: f32) -> u8 {
@@ -54,7 +54,7 @@ fn display_from_linear(v: f64) -> f64 {
 }
 
 const LINEAR: usize = 4096;
-/// In the dark a display colour is a 12.92 * 255th of linear light: four entries.
+/// In the dark, a step of a display colour is 1 / (12.92 * 255) of linear light: about five entries.
 const SHOWN: usize = 16384;
 
 #[cfg(test)]
@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn display_colours_come_back() {
+    fn display_colours_survive_a_round_trip() {
         let tone = Tone::default();
         for byte in 0..=255u8 {
             assert_eq!(tone.shown(tone.linear(f32::from(byte) / 255.0)), byte);

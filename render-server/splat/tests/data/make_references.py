@@ -1,13 +1,12 @@
 #!/usr/bin/env python3
-"""Makes the small scenes of this folder and what the float64 numpy oracle renders of them.
+"""Creates the small scenes of this folder, and their images by the float64 numpy oracle.
 
     python3 make_references.py ORACLE.py
 
-ORACLE.py is an independent module with `load_ply(path)` and `render(splats, camera)` as
-tests/images/oracle.rs describes them; numpy is all it needs. Writes sh0 to sh3: .ply (INRIA
-layout), and for cameras a and b of each: _a.json (camera), _a.npz (rgb, alpha, depth, depth_median;
-float32, rounded); of camera a also what is seen where the scene was
-trained with anti-aliasing: _a_antialiased.npz. The same numbers on every machine.
+ORACLE.py is an independent module that needs only numpy, with `load_ply(path)` and `render(splats, camera)`
+as described in tests/images/oracle.rs. Writes sh0 to sh3: .ply (INRIA layout), and for cameras a and b of each:
+_a.json (camera) and _a.npz (rgb, alpha, depth, depth_median; float32, rounded). For camera a it also writes
+_a_antialiased.npz: the image if the scene was trained with anti-aliasing. Results are equal on all machines.
 """
 import importlib.util
 import json
@@ -16,12 +15,12 @@ import sys
 
 import numpy as np
 
-# Width, height: one much wider than high, so that tiles are cut on both sides.
+# Width, height. One is much wider than high, so that tiles are cut on both sides.
 SIZES = dict(a=(64, 48), b=(80, 36))
 
 
 def scene(rng, degree, count):
-    """Some large flat splats behind, many small ones before them, all sorts of opacity."""
+    """Returns some large flat splats in the background and many small ones in front, with all opacities."""
     rest = 3 * ((degree + 1) ** 2 - 1)
     large = count // 5
     xyz = np.concatenate([rng.uniform([-3, -2, 4], [3, 2, 7], (large, 3)),
@@ -45,8 +44,8 @@ def write_ply(path, rows, degree):
 
 
 def camera(degree, which):
-    """Off-centre, unequal focal lengths, turned about all axes, on a background. `a` stands before
-    the scene; `b` is wide, and stands within it: splats beside, behind and around it."""
+    """Returns a camera with an off-centre principal point, unequal focal lengths, rotation about all axes, and a
+    background. `a` is in front of the scene; `b` is wide and within the scene, surrounded by splats."""
     a, b, c = 0.05 + 0.07 * degree, -0.12 + 0.08 * degree, 0.1 * degree
     (w, h), f, shift = SIZES[which], 1.0, [0.1 * degree, -0.05, 0.3 - 0.2 * degree]
     if which == 'b':
@@ -62,7 +61,7 @@ def camera(degree, which):
 
 
 def rounded(name, v):
-    """Colour and alpha to 1/4096 (83 dB), depth to 12 bits (1.2e-4 at most), so that they pack well."""
+    """Rounds colour and alpha to 1/4096 (83 dB), depth to 12 bits (at most 1.2e-4), so that they compress well."""
     if name.startswith('depth'):
         mantissa, exponent = np.frexp(v)
         return np.ldexp(np.round(mantissa * 4096) / 4096, exponent).astype('<f4')
@@ -70,8 +69,8 @@ def rounded(name, v):
 
 
 def antialiased(project, blur=0.3):
-    """The oracle's projection, each opacity times the square root of the determinants' ratio without
-    and with the pixel's blur, at least 0: gsplat's rasterize_mode="antialiased"."""
+    """Returns the oracle's projection, with each opacity multiplied by the square root of the ratio of the
+    determinants without and with the pixel's blur, at least 0: gsplat's rasterize_mode="antialiased"."""
     def compensated(splats, cam, *args, **kwargs):
         p = project(splats, cam, *args, **kwargs)
         a, b, c = p['conic'].T                    # the inverse of the blurred covariance

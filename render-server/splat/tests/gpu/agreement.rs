@@ -1,4 +1,4 @@
-//! Scenes with structure: 50 dB and depths within 1 % of the processor's images.
+//! Structured scenes: images agree with those of the CPU renderer to 50 dB, depths to 1 %.
 
 use std::path::Path;
 
@@ -11,9 +11,9 @@ use vizflyt_splat::{Atmosphere, Camera, RgbdImage, RigidObject, Scene, Splats, p
 
 use crate::{both, compare, twins};
 
-/// Fails unless images are 50 dB alike, and depths within 1 % but at edges: where one splat more or
-/// less moves the place at which half of the light is gone, depth jumps from surface to surface.
-/// Those are 0.5 % of the pixels at most, and one pixel of a tiny image.
+/// Checks that images agree to 50 dB, and depths to 1 % except at edges: where one splat more or less moves the point
+/// at which half of the light is gone, depth jumps between surfaces. Such pixels are at most 0.5 %, and one pixel in
+/// a tiny image.
 pub(crate) fn assert_alike(what: &str, actual: &RgbdImage, expected: &RgbdImage) {
     assert_eq!((actual.width_px, actual.height_px), (expected.width_px, expected.height_px));
     let rgb_db = compare::psnr_db(&actual.rgb, &expected.rgb);
@@ -59,9 +59,9 @@ fn generated_twins_of_every_degree_agree() {
     }
 }
 
-/// Weather is one pass over finished images: what two renderers agree on, they agree on in any weather.
+/// Weather is one pass over finished images: renderers that agree without weather also agree with it.
 #[test]
-fn both_are_seen_in_the_same_weather() {
+fn images_agree_in_weather() {
     let splats = twins::cloud(4000, 0, 7);
     let dim = Atmosphere { light: [0.3; 3], ..Atmosphere::CLEAR };
     let camera = Camera { atmosphere: dim, ..twins::camera(160, 120, 80.0) };
@@ -91,12 +91,12 @@ fn both_are_seen_in_the_same_weather() {
     for image in expected.iter_mut().chain(&mut actual) {
         WeatherPass::default().apply(&weather, &camera, &moment, image);
     }
-    assert_ne!(expected[0].rgb, clear, "there is weather");
+    assert_ne!(expected[0].rgb, clear, "weather has no effect");
     assert_alike("weather", &actual[0], &expected[0]);
 }
 
 #[test]
-fn cameras_of_all_sizes_are_rendered_at_once() {
+fn renders_cameras_of_all_sizes_at_once() {
     let splats = twins::cloud(3000, 1, 3);
     let sizes = [(1, 1), (1, 50), (50, 1), (15, 17), (16, 16), (33, 7), (320, 240), (2, 3)];
     let cameras: Vec<Camera> = (0..)
@@ -142,7 +142,7 @@ fn antialiased_twins_and_objects_agree() {
     };
     let (Some((_, with)), Some((_, without))) = (render(true), render(false)) else { return };
     assert!(compare::psnr_db(&with[0].rgb, &without[0].rgb) < 45.0);
-    // Of objects of equal splats, the dimmed one hides less.
+    // Of two objects with equal splats, the dimmed one hides less.
     let seen = |id: u16| without[0].ids.iter().filter(|&&seen| seen == id).count();
     assert!(seen(8) > 50 && seen(8) < seen(7), "{} and {}", seen(8), seen(7));
 }
@@ -178,7 +178,7 @@ fn both_lens_models_agree() {
 }
 
 #[test]
-fn objects_are_where_they_are_placed_and_named() {
+fn objects_agree_in_placement_and_id() {
     let splats = twins::cloud(2500, 2, 5);
     let objects = [
         RigidObject { id: 7, splats: twins::ball(300, 0.35, 0) },
@@ -196,7 +196,7 @@ fn objects_are_where_they_are_placed_and_named() {
     for id in [0, 7, 65_535] {
         assert!(actual[0].ids.iter().filter(|&&seen| seen == id).count() > 50, "id {id}");
     }
-    assert!(actual[0].ids.iter().all(|&id| id != 3), "what is not there is not seen");
+    assert!(actual[0].ids.iter().all(|&id| id != 3), "the absent object is visible");
 }
 
 #[test]
@@ -244,7 +244,7 @@ fn images_do_not_depend_on_earlier_images() {
     };
     let first = render_all(&[camera]);
     let several = render_all(&[away, small, camera, small]);
-    // Bit for bit.
+    // Bit-identical.
     assert!(several[2] == first[0] && several[1] == several[3]);
     assert!(several[0].alpha.iter().all(|&alpha| alpha == 0.0));
     assert!(render_all(&[small])[0] == several[1]);
@@ -252,7 +252,7 @@ fn images_do_not_depend_on_earlier_images() {
 }
 
 #[test]
-fn two_ticks_may_be_under_way() {
+fn two_ticks_in_flight_give_the_same_images() {
     let splats = twins::cloud(3000, 0, 9);
     let Some(mut gpu) = crate::renderer(&splats) else { return };
     let cameras = [40u32, 50, 60, 70].map(|width| twins::camera(width, 45, 70.0));

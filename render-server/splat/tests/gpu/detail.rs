@@ -1,4 +1,5 @@
-//! Adaptive detail: the blocks that the processor's renderer takes, from a tree that is walked otherwise.
+//! Adaptive detail: the GPU renderer selects the same blocks as the CPU renderer, although its walk of the tree
+//! differs.
 
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
@@ -18,7 +19,7 @@ fn look(from: DVec3, to: DVec3, k: Intrinsics) -> Camera {
     Camera { background: [0.5, 0.6, 0.8], ..Camera::new(k, Pose::new(from, rotation), 0.05) }
 }
 
-/// From afar, from above, in a street; and through a lens.
+/// Returns cameras far away, above and in a street, and one through a lens.
 fn cameras() -> Vec<Camera> {
     let k = Intrinsics::from_horizontal_fov(160, 120, 90f64.to_radians());
     let bent = Distortion::BrownConrady { k1: -0.2, k2: 0.05, p1: 1e-3, p2: -1e-3, k3: 0.0 };
@@ -41,9 +42,9 @@ fn rendered(
 }
 
 #[test]
-fn the_same_blocks_are_rendered_as_by_the_processor() {
+fn renders_the_same_blocks_as_the_cpu() {
     let Some(adapter) = adapter() else { return };
-    // A swarm of a hundred metres, seen from near and afar, turned otherwise than the city.
+    // A ball of a hundred metres, seen from near and far, rotated differently from the city.
     let ball = twins::ball(30_000, 50.0, 1);
     let objects = [RigidObject { id: 9, splats: ball }];
     let turned = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, -0.7, 1.1);
@@ -62,12 +63,13 @@ fn the_same_blocks_are_rendered_as_by_the_processor() {
             let (actual, by_gpu) = rendered(&mut gpu, &placements, &[camera]);
             let (_, whole) = rendered(&mut every, &placements, &[camera]);
             assert_alike(&what, &actual[0], &expected[0]);
-            // Blocks whose error is the allowed one to f32's rounding may be taken either way.
+            // If the error of a block equals the allowed error within the rounding of f32, either level may be
+            // selected.
             assert!(by_gpu.abs_diff(by_cpu) * 100 <= by_cpu, "{what}: {by_gpu} and {by_cpu}");
             (merged, all) = (merged + by_gpu, all + whole);
         }
         assert!(merged * 10 < all * 9, "rendered {merged} of {all}");
-        // All at once as one by one.
+        // All cameras at once give the same images as one by one.
         let (together, _) = rendered(&mut gpu, &placements, &cameras());
         for (camera, image) in cameras().into_iter().zip(&together) {
             assert_eq!(&rendered(&mut gpu, &placements, &[camera]).0[0], image);

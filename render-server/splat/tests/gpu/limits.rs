@@ -1,4 +1,4 @@
-//! Too little room, small bindings, devices that go.
+//! Insufficient buffers, small bindings, and lost devices.
 
 use vizflyt_protocol::geometry::Intrinsics;
 use vizflyt_splat::gpu::{Budget, GpuRenderer};
@@ -21,7 +21,7 @@ fn with_budget<'a>(scene: impl Into<Scene<'a>>, budget: Budget) -> Option<GpuRen
 }
 
 #[test]
-fn too_little_room_is_noticed_and_made() {
+fn grows_buffers_that_are_too_small() {
     let splats = twins::cloud(3000, 0, 1);
     let cameras = [twins::camera(80, 60, 90.0), twins::camera(64, 64, 70.0)];
     let Some(mut ample) = renderer(&splats) else { return };
@@ -31,28 +31,28 @@ fn too_little_room_is_noticed_and_made() {
     for (regions, pairs) in [(1, 1 << 20), (4096, 1), (1, 1), (3, 1000)] {
         let budget = Budget { regions, pairs, ..Budget::default() };
         let mut gpu = with_budget(&splats, budget).expect("an adapter was there");
-        // Two ticks at once: both have too little.
+        // Two ticks in flight: both have too little room.
         let mut first = vec![RgbdImage::default(); 2];
         let mut second = first.clone();
         gpu.begin(&[], &cameras).expect("cameras");
         gpu.begin(&[], &cameras).expect("cameras");
         gpu.finish(&mut first).expect("images");
         gpu.finish(&mut second).expect("images");
-        // Bit for bit: not one splat is missing.
+        // Bit-identical: no splat is missing.
         assert!(first == expected && second == expected, "{regions} regions, {pairs} pairs");
         assert_eq!(gpu.workload(), work);
     }
 }
 
 #[test]
-fn pixels_are_the_same_written_to_the_host_or_copied() {
+fn pixels_written_to_the_host_equal_copied_pixels() {
     let objects = [RigidObject { id: 9, splats: twins::ball(400, 0.4, 3) }];
     let splats = twins::cloud(2000, 1, 5);
     let at = [Some(vizflyt_protocol::geometry::Pose::new(
         glam::DVec3::new(0.1, 0.0, 1.5),
         glam::DQuat::IDENTITY,
     ))];
-    // A small image after a large one has the large one's memory.
+    // A small image after a large one reuses the memory of the large one.
     for objects in [&objects[..], &[]] {
         let scene = Scene { splats: &splats, objects };
         let Some(mut written) = with_budget(scene, Budget::default()) else { return };
@@ -71,20 +71,20 @@ fn pixels_are_the_same_written_to_the_host_or_copied() {
 }
 
 #[test]
-fn scenes_are_split_into_what_a_binding_holds() {
+fn splits_scenes_by_the_size_of_a_binding() {
     let splats = twins::cloud(1500, 3, 2);
-    // 6 frame-filling blocks: harmonics of three, geometry of five, regions for six.
+    // 6 frame-filling blocks: harmonics for three, geometry for five, regions for six.
     let tiny = Budget { binding_bytes: 79_000, ..Budget::default() };
     let cameras: Vec<Camera> = (0..6u32).map(|i| twins::camera(20 + i, 30 - i, 80.0)).collect();
     let Some(mut ample) = renderer(&splats) else { return };
     let expected = render_all(&mut ample, &cameras);
     let mut gpu = with_budget(&splats, tiny).expect("an adapter was there");
-    // More than fits at once, again and again.
+    // Repeatedly more than fits at once.
     for _ in 0..2 {
         assert!(render_all(&mut gpu, &cameras) == expected);
     }
     assert!(render_all(&mut gpu, &cameras[..1])[0] == expected[0]);
-    // Objects lie in other chunks than what stands still.
+    // Objects are in other chunks than the static part.
     let objects = [RigidObject { id: 9, splats: twins::ball(400, 0.4, 3) }];
     let small = twins::cloud(300, 1, 4);
     let scene = Scene { splats: &small, objects: &objects };
@@ -102,7 +102,7 @@ fn scenes_are_split_into_what_a_binding_holds() {
 }
 
 #[test]
-fn images_too_large_for_the_device_are_rendered_by_the_cpu() {
+fn renders_images_too_large_for_the_device_on_the_cpu() {
     let splats = twins::cloud(1500, 0, 2);
     let tiny = Budget { binding_bytes: 79_000, ..Budget::default() };
     let Some(mut gpu) = with_budget(&splats, tiny) else { return };
@@ -110,7 +110,7 @@ fn images_too_large_for_the_device_are_rendered_by_the_cpu() {
     let refused = gpu.render(&[], &large, &mut [RgbdImage::default()]);
     let Err(RenderError::Device(why)) = refused else { panic!("{refused:?}") };
     assert!(why.contains("pixels: 20000"), "{why}");
-    // And what fits still works.
+    // Smaller images still work.
     let small = [twins::camera(20, 20, 80.0)];
     let expected = render_all(&mut CpuRenderer::new(&splats), &small);
     assert_alike("after all", &render_all(&mut gpu, &small)[0], &expected[0]);
@@ -124,14 +124,14 @@ fn images_too_large_for_the_device_are_rendered_by_the_cpu() {
 }
 
 #[test]
-fn the_widest_image_and_more_cameras_than_a_tick_has_are_rendered() {
+fn renders_the_widest_image_and_more_cameras_than_a_tick_has() {
     let splats = twins::cloud(300, 0, 2);
     let Some(mut gpu) = renderer(&splats) else { return };
     let mut cpu = CpuRenderer::new(&splats);
     let widest = [twins::camera(Intrinsics::MAX_SIDE_PX, 2, 80.0)];
     let expected = render_all(&mut cpu, &widest);
     assert_alike("the widest", &render_all(&mut gpu, &widest)[0], &expected[0]);
-    // A tick has 4096.
+    // The maximum per tick is 4096.
     let mut many = vec![twins::camera(1, 1, 80.0); 4097];
     many[4096] = twins::camera(20, 10, 80.0);
     let expected = render_all(&mut cpu, &many[4096..]);
@@ -139,7 +139,7 @@ fn the_widest_image_and_more_cameras_than_a_tick_has_are_rendered() {
 }
 
 #[test]
-fn the_processor_takes_over_when_a_device_is_lost() {
+fn cpu_takes_over_when_a_device_is_lost() {
     let splats = twins::cloud(2000, 1, 6);
     let camera = [twins::camera(90, 70, 80.0)];
     let Some(mut gpu) = renderer(&splats) else { return };
@@ -147,7 +147,7 @@ fn the_processor_takes_over_when_a_device_is_lost() {
     gpu.lose_device();
     let lost = gpu.render(&[], &camera, &mut [RgbdImage::default()]);
     assert!(matches!(lost, Err(RenderError::Device(_))), "{lost:?}");
-    // And stays so.
+    // The device stays lost.
     assert!(gpu.render(&[], &camera, &mut [RgbdImage::default()]).is_err());
     let mut fallback = FallbackRenderer::new(Box::new(gpu), CpuRenderer::new(&splats));
     assert!(fallback.name().starts_with("gpu "), "{}", fallback.name());
@@ -158,13 +158,13 @@ fn the_processor_takes_over_when_a_device_is_lost() {
 }
 
 #[test]
-fn a_device_lost_between_begin_and_finish_is_an_error() {
+fn device_lost_between_begin_and_finish_is_an_error() {
     let splats = twins::cloud(2000, 0, 6);
     let camera = [twins::camera(90, 70, 80.0)];
     let Some(mut gpu) = renderer(&splats) else { return };
     gpu.begin(&[], &camera).expect("a camera");
     gpu.lose_device();
-    // Either the tick was done before, or the loss is reported; nothing hangs or panics.
+    // Either the tick was finished before, or the loss is reported; nothing hangs or panics.
     let mut image = [RgbdImage::default()];
     match gpu.finish(&mut image) {
         Ok(_) => crate::compare::assert_clean(&image[0]),
@@ -174,7 +174,7 @@ fn a_device_lost_between_begin_and_finish_is_an_error() {
 }
 
 #[test]
-fn choice_has_a_reason() {
+fn choice_of_the_renderer_has_a_reason() {
     let splats = twins::cloud(1500, 0, 8);
     let camera = [twins::camera(60, 40, 80.0)];
     let expected = render_all(&mut CpuRenderer::new(&splats), &camera);

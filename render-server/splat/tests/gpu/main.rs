@@ -1,5 +1,5 @@
-//! The renderer for graphics cards against the one for processors, on whatever adapter there is:
-//! software Vulkan (`mesa-vulkan-drivers`) will do. Without any, each test prints what it skips.
+//! Compares the GPU renderer with the CPU renderer, on any available adapter; software Vulkan (`mesa-vulkan-drivers`)
+//! is sufficient. Without an adapter, tests print what they skip.
 #![cfg(feature = "gpu")]
 
 mod agreement;
@@ -28,7 +28,7 @@ fn adapter() -> Option<&'static Adapter> {
     adapter
 }
 
-/// Returns a renderer that starts with ample room.
+/// Returns a renderer with the default budget.
 fn renderer<'a>(scene: impl Into<Scene<'a>>) -> Option<GpuRenderer> {
     Some(GpuRenderer::new(scene, adapter()?, Budget::default()).expect("a device"))
 }

@@ -33,7 +33,7 @@ fn one(mean_m: Vec3, scale_m: Vec3, opacity: f32) -> Splats {
     }
 }
 
-/// Renders scene after scene on one device.
+/// Renders several scenes on one device.
 struct GpuTest(GpuRenderer);
 
 impl GpuTest {
@@ -73,7 +73,7 @@ fn extreme_scales_and_opacities_stay_clean_and_agree() {
 }
 
 #[test]
-fn distances_from_behind_to_far_stay_clean() {
+fn images_stay_clean_from_behind_the_camera_to_far_away() {
     let Some(mut renderer) = GpuTest::new() else { return };
     let camera = looking_ahead(40, 30, 80.0);
     let near = camera.near_m;
@@ -91,13 +91,13 @@ fn distances_from_behind_to_far_stay_clean() {
             }
         }
     }
-    // Inside a splat: the camera sees what of it lies beyond the near plane.
+    // Inside a splat: the part beyond the near plane is visible.
     let inside = one(Vec3::new(0.0, 0.0, 0.06), Vec3::splat(3.0), 0.9);
     assert!(renderer.render_one(&inside, &camera).alpha.iter().all(|&alpha| alpha > 0.85));
 }
 
 #[test]
-fn every_size_and_field_of_view_is_rendered() {
+fn renders_every_size_and_field_of_view() {
     let Some(mut renderer) = GpuTest::new() else { return };
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);
     for fov_deg in [1.0, 10.0, 90.0, 150.0, 170.0] {
@@ -114,12 +114,12 @@ fn every_size_and_field_of_view_is_rendered() {
 }
 
 #[test]
-fn nothing_to_see_is_the_background() {
+fn empty_scene_shows_the_background() {
     let Some(mut renderer) = GpuTest::new() else { return };
     let camera = looking_ahead(21, 10, 90.0);
     for splats in [Splats::default(), one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.001)] {
         let image = renderer.render_one(&splats, &camera);
-        // Halves: 0.2 is off by 5e-5.
+        // Colours are halves: 0.2 is off by 5e-5.
         let off = |rgb: &[f32]| {
             rgb.iter().zip([0.2, 0.4, 0.6]).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
         };
@@ -130,14 +130,14 @@ fn nothing_to_see_is_the_background() {
 }
 
 #[test]
-fn damaged_scenes_give_the_images_of_what_is_left() {
+fn damaged_scenes_show_their_valid_splats() {
     let Some(mut renderer) = GpuTest::new() else { return };
     let state = &mut 5;
     for round in 0..24 {
         let mut splats = twins::cloud(300, 1, round);
         let numbers = splats.sh_coefficients() * 3;
         for _ in 0..40 {
-            // Any bits at all, most of them at odd exponents.
+            // Arbitrary bits, most of them with extreme exponents.
             let v = f32::from_bits((twins::random(state, 0.0, 1.0) * u32::MAX as f32) as u32);
             let i = twins::random(state, 0.0, 299.0) as usize;
             match twins::random(state, 0.0, 7.0) as usize {
@@ -159,7 +159,7 @@ fn damaged_scenes_give_the_images_of_what_is_left() {
 }
 
 #[test]
-fn invalid_cameras_and_placements_are_refused() {
+fn rejects_invalid_cameras_and_placements() {
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);
     let objects = [RigidObject { id: 1, splats: splats.clone() }];
     let Some(mut gpu) = renderer(Scene { splats: &splats, objects: &objects }) else { return };

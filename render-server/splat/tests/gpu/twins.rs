@@ -1,4 +1,4 @@
-//! Small scenes and cameras.
+//! Small test scenes and cameras.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use serde::Deserialize;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_splat::{Camera, Splats};
 
-/// Knuth's MMIX generator; its upper 24 bits, from `low` to `high`.
+/// Knuth's MMIX generator; returns its upper 24 bits, scaled from `low` to `high`.
 pub(crate) fn random(state: &mut u64, low: f32, high: f32) -> f32 {
     *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
     low + (*state >> 40) as f32 / (1u64 << 24) as f32 * (high - low)
@@ -25,7 +25,7 @@ fn add(splats: &mut Splats, state: &mut u64, mean: Vec3, scale: f32) {
     }
 }
 
-/// A wall at 3 m, clutter before it, and some of it behind the camera at the origin.
+/// Returns a wall at 3 m, clutter in front of it, and some of it behind the camera at the origin.
 pub(crate) fn cloud(count: usize, sh_degree: u8, seed: u64) -> Splats {
     let mut splats = Splats { sh_degree, ..Splats::default() };
     let state = &mut seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
@@ -41,7 +41,7 @@ pub(crate) fn cloud(count: usize, sh_degree: u8, seed: u64) -> Splats {
     splats
 }
 
-/// A sphere around the origin.
+/// Returns a sphere around the origin.
 pub(crate) fn ball(count: usize, radius_m: f32, sh_degree: u8) -> Splats {
     let mut splats = Splats { sh_degree, ..Splats::default() };
     let state = &mut 77;
@@ -53,7 +53,7 @@ pub(crate) fn ball(count: usize, radius_m: f32, sh_degree: u8) -> Splats {
     splats
 }
 
-/// Looks along z from the origin, a little off its middle.
+/// Returns a camera at the origin that looks along z, slightly off its middle.
 pub(crate) fn camera(width_px: u32, height_px: u32, fov_deg: f64) -> Camera {
     let k = Intrinsics::from_horizontal_fov(width_px, height_px, fov_deg.to_radians());
     Camera {
@@ -66,7 +66,7 @@ pub(crate) fn camera(width_px: u32, height_px: u32, fov_deg: f64) -> Camera {
     }
 }
 
-/// Reads a camera in the oracle's form: rows of world to camera.
+/// Reads a camera in the oracle's format: rows of world to camera.
 pub(crate) fn oracle_camera(path: &Path) -> Camera {
     #[derive(Deserialize)]
     struct File {

@@ -1,4 +1,4 @@
-//! Fast renderers against the plain one, on random scenes and cameras.
+//! Comparison of fast renderers with the reference, on random scenes and cameras.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
@@ -10,7 +10,7 @@ use crate::{compare, cuts};
 pub(crate) fn splats(count: std::ops::Range<usize>) -> impl Strategy<Value = Splats> {
     let splat = (
         prop::array::uniform3(-4.0..4.0f32),
-        // Log scales: 1 mm to 1.6 m.
+        // Logarithms of the scales: 1 mm to 1.6 m.
         prop::array::uniform3(-7.0..0.5f32),
         prop::array::uniform4(-1.0..1.0f32),
         0.0..=1.0f32,
@@ -33,7 +33,7 @@ pub(crate) fn splats(count: std::ops::Range<usize>) -> impl Strategy<Value = Spl
     })
 }
 
-/// No lens, or one up to where it turns back, wild ones too.
+/// Returns no lens, or one up to its reach, including extreme ones.
 pub(crate) fn distortion() -> impl Strategy<Value = Distortion> {
     let radial = || -0.3..0.3f64;
     let small = || -0.01..0.01f64;
@@ -46,7 +46,7 @@ pub(crate) fn distortion() -> impl Strategy<Value = Distortion> {
     ]
 }
 
-/// Clear air, or light and fog from haze to soup.
+/// Returns clear air, or light and fog from haze to dense fog.
 pub(crate) fn atmosphere() -> impl Strategy<Value = Atmosphere> {
     let colour = || prop::array::uniform3(0.0..1.0f32);
     let some = (colour(), prop_oneof![Just(0.0), 0.001..20.0f32], colour())
@@ -113,23 +113,23 @@ pub(crate) fn check(splats: &Splats, cameras: &[Camera]) {
     }
 }
 
-/// Fails unless an image agrees with one of [`cuts::references`].
+/// Checks that an image agrees with one of [`cuts::references`].
 pub(crate) fn assert_agrees(name: &str, actual: &RgbdImage, expected: &[RgbdImage]) {
     let faults: Vec<String> =
         expected.iter().map_while(|expected| disagreement(actual, expected)).collect();
     assert!(faults.len() < expected.len(), "{name}: {}", faults.join("; or "));
 }
 
-/// Says how two images disagree. Two limits: the share of pixels off, which thresholds of f32 flip,
-/// and the error of the others.
+/// Returns how two images disagree, if they do. Two limits: the share of wrong pixels, which flip at thresholds of
+/// f32, and the error of the others.
 fn disagreement(actual: &RgbdImage, expected: &RgbdImage) -> Option<String> {
     let pixels = expected.alpha.len();
-    // Colours may be large where harmonics add up; they are judged relative to 1 or the colour.
+    // Colours may be large where harmonics add up; errors are relative to the larger of 1 and the colour.
     let off = |i: usize| {
         let near = |a: f32, b: f32, limit: f32| (a - b).abs() <= limit * b.abs().max(1.0);
         let rgb = (0..3).all(|k| near(actual.rgb[i * 3 + k], expected.rgb[i * 3 + k], 4e-3));
         let (a, b) = (actual.depth_expected_m[i], expected.depth_expected_m[i]);
-        // Where next to nothing contributes, one splat more or less is the depth.
+        // Where the alpha is close to 0, one splat more or less determines the depth.
         let depth = expected.alpha[i] < 0.05 || near(a, b, 1e-2);
         !(rgb && near(actual.alpha[i], expected.alpha[i], 2e-3) && depth)
     };
@@ -138,7 +138,7 @@ fn disagreement(actual: &RgbdImage, expected: &RgbdImage) -> Option<String> {
     if outliers > 1 + pixels / 200 {
         return Some(format!("{outliers} of {pixels} pixels are off"));
     }
-    // Where transmittance is about one half, of the pixels that reach it.
+    // Pixels with transmittance close to one half may differ, among those that reach it.
     let solid = expected.alpha.iter().filter(|&&alpha| alpha > 0.5).count();
     let (a, b) = (&actual.depth_median_m, &expected.depth_median_m);
     let share = compare::depth_off(a, b, &expected.alpha, 1e-3);
@@ -146,12 +146,12 @@ fn disagreement(actual: &RgbdImage, expected: &RgbdImage) -> Option<String> {
     if median_off > 1 + solid / 100 {
         return Some(format!("{median_off} of {solid} median depths are off"));
     }
-    // Where two objects are about equally far, or transmittance is about one half.
+    // Pixels where two objects are about equally far, or transmittance is close to one half.
     let ids_off = actual.ids.iter().zip(&expected.ids).filter(|(a, b)| a != b).count();
     (ids_off > 1 + pixels / 100).then(|| format!("{ids_off} of {pixels} ids are off"))
 }
 
-/// Runs a property so often, or as `PROPTEST_CASES` asks.
+/// Returns a configuration with `usual` cases, or with the number in `PROPTEST_CASES`.
 pub(crate) fn cases(usual: u32) -> ProptestConfig {
     let asked = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok());
     ProptestConfig::with_cases(asked.unwrap_or(usual))
@@ -168,8 +168,8 @@ proptest! {
     }
 }
 
-/// A large splat beside a small image, with its mean on the lens's reach: 5e-7 of it beyond, too
-/// little for f32. Found by [`fast_equals_reference`].
+/// Returns a large splat next to a small image, with its mean 5e-7 beyond the reach of the lens, less than f32
+/// resolves. Found by [`fast_equals_reference`].
 fn by_the_reach() -> (Splats, Camera) {
     let splats = Splats {
         means_m: vec![Vec3::new(0.9338181, 3.8448615, 1.2943631)],
@@ -207,20 +207,20 @@ fn by_the_reach() -> (Splats, Camera) {
 }
 
 #[test]
-fn a_splat_on_the_reach_is_there_or_gone() {
+fn renders_or_omits_a_splat_on_the_reach() {
     let (splats, camera) = by_the_reach();
-    assert_eq!(cuts::references(&splats, &[], &camera).len(), 2, "it is not on the cut");
+    assert_eq!(cuts::references(&splats, &[], &camera).len(), 2, "the splat is not on the cut");
     check(&splats, &[camera]);
 }
 
-/// Further from a cut than f32 rounds, nothing is left open.
+/// At a distance from a cut greater than the rounding of f32, the result is unique.
 #[test]
-fn a_splat_next_to_a_cut_is_where_the_reference_has_it() {
+fn splat_next_to_a_cut_matches_the_reference() {
     let (found, camera) = by_the_reach();
     let forward = camera.world_from_cam.rotation * DVec3::Z;
     let mean = found.means_m[0].as_dvec3();
     let z_m = forward.dot(mean - camera.world_from_cam.translation_m);
-    // How far ahead of the reach and of the near plane, as shares of z, with which slopes shrink.
+    // Distances from the reach and from the near plane, as shares of z; slopes shrink with them.
     for (reach, near, shown) in
         [(-5e-6, 0.5, false), (5e-6, 0.5, true), (5e-6, 5e-6, true), (5e-6, -5e-6, false)]
     {
@@ -234,9 +234,9 @@ fn a_splat_next_to_a_cut_is_where_the_reference_has_it() {
     }
 }
 
-/// Of few pixels that reach half, one may be at half as nearly as f32 tells, but no more.
+/// Among few pixels that reach half, one may flip within the rounding of f32, but no more.
 #[test]
-fn one_median_depth_may_flip_among_few() {
+fn comparison_allows_one_flipped_median_depth() {
     let mut expected = RgbdImage::default();
     expected.resize(10, 52);
     expected.alpha[..63].fill(0.9);
@@ -248,12 +248,12 @@ fn one_median_depth_may_flip_among_few() {
     assert_eq!(disagreement(&actual, &expected).unwrap(), "2 of 63 median depths are off");
 }
 
-/// A wall of identical small splats and one camera that looks straight at it.
+/// Returns a wall of identical small splats, and a camera that looks straight at it.
 fn wall() -> (Splats, Camera) {
     let mut splats = Splats::default();
     for y in -40..=40 {
         for x in -60..=60 {
-            // A slight slope, so that no two depths are equal and the order is no matter of taste.
+            // A slight slope, so that no two depths are equal and the order is unique.
             let z = 2.0 + x as f32 * 1e-3 + y as f32 * 3e-5;
             splats.means_m.push(Vec3::new(x as f32 * 0.02, y as f32 * 0.02, z));
             splats.scales_m.push(Vec3::new(0.012, 0.012, 0.001));
@@ -285,9 +285,9 @@ fn images_do_not_depend_on_earlier_images() {
         renderer.render(&[], &[away, small, camera, small], &mut several).unwrap();
         assert_eq!(several[2], first[0], "{}", renderer.name());
         assert_eq!(several[1], several[3], "{}", renderer.name());
-        // The one that looks away sees the background and nothing else.
+        // The camera that looks away sees only the background.
         assert!(several[0].rgb.iter().chain(&several[0].alpha).all(|&v| v == 0.0));
-        // An image that was larger before holds only the new one.
+        // An image that was larger before contains only the new image.
         let mut reused = [first[0].clone()];
         renderer.render(&[], &[small], &mut reused).unwrap();
         assert_eq!(reused[0], several[1], "{}", renderer.name());
@@ -295,7 +295,7 @@ fn images_do_not_depend_on_earlier_images() {
 }
 
 #[test]
-fn a_wall_is_where_it_stands() {
+fn depth_of_a_wall_is_correct() {
     let (splats, camera) = wall();
     check(&splats, &[camera]);
     let mut image = [RgbdImage::default()];
@@ -308,10 +308,10 @@ fn a_wall_is_where_it_stands() {
     }
 }
 
-/// A splat within the lens's reach whose slope, clamped to what the image shows, is beyond it. Found by
-/// [`fast_equals_reference`]: the reference shortened it for the lens alone, and not for the pinhole.
+/// A splat within the lens's reach whose slope, clamped to the image, is beyond it. Found by
+/// [`fast_equals_reference`]: the reference shortened the slope only for the lens, not for the pinhole.
 #[test]
-fn a_slope_clamped_beyond_the_reach_is_shortened() {
+fn shortens_a_slope_clamped_beyond_the_reach() {
     let splats = Splats {
         means_m: vec![Vec3::new(-2.180_503_4, -2.445_525_4, 3.006_775_6)],
         scales_m: vec![Vec3::ONE],

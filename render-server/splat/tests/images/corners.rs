@@ -1,5 +1,5 @@
-//! Where things land: a checkerboard's corners and single dots against the projection formula, to
-//! 0.05 px, through pinholes and lenses; and what two cameras see of one wall.
+//! Positions in images: corners of a checkerboard and single dots against the projection formula, to 0.05 px, through
+//! pinholes and lenses; and a stereo pair in front of a wall.
 
 use glam::{DMat2, DQuat, DVec2, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
@@ -7,9 +7,9 @@ use vizflyt_splat::{Atmosphere, Camera, Rasterizer, RgbdImage, Scene, Splats};
 
 use crate::renderers;
 
-/// The error allowed. [px]
+/// Maximum error. [px]
 const LIMIT_PX: f64 = 0.05;
-/// Squares of a board, across and down.
+/// Squares of a board, horizontally and vertically.
 const SQUARES: [i32; 2] = [8, 6];
 /// Side of a square. [m]
 const SIDE_M: f64 = 0.13;
@@ -24,7 +24,7 @@ fn add(splats: &mut Splats, at: DVec3, scale_m: Vec3, rotation: DQuat, opacity: 
     splats.sh.extend([1.7; 3]);
 }
 
-/// Where boards hang, 2 m from the origin: ahead of a camera that looks along z, to its right, and
+/// Returns the poses of the boards, 2 m from the origin: in front of a camera that looks along z, to its right, and
 /// far to its left.
 fn boards() -> [Pose<World, World>; 3] {
     [(0.0, 0.1), (-0.75, -0.2), (1.25, 0.15)].map(|(turn, tilt)| {
@@ -33,8 +33,8 @@ fn boards() -> [Pose<World, World>; 3] {
     })
 }
 
-/// Three checkerboards: white squares of splats, the black ones left out. So a corner lies where
-/// two squares of one colour meet, and however soft their edges are, it is the point of symmetry.
+/// Returns three checkerboards: white squares of splats, without the black ones. A corner is where two white squares
+/// meet; it is the point of symmetry, even if their edges are soft.
 pub(crate) fn scene() -> Splats {
     let mut splats = Splats::default();
     for world_from_board in boards() {
@@ -59,7 +59,7 @@ pub(crate) fn scene() -> Splats {
     splats
 }
 
-/// The boards' inner corners. [m, world]
+/// Returns the inner corners of the boards. [m, world]
 fn corners() -> Vec<DVec3> {
     let mut corners = Vec::new();
     for world_from_board in boards() {
@@ -74,8 +74,8 @@ fn corners() -> Vec<DVec3> {
     corners
 }
 
-/// Where the corner near `start` is: the saddle of the alpha, smoothed by a Gaussian so that it has
-/// derivatives anywhere, found by Newton's method. [px]
+/// Returns the position of the corner near `start`: the saddle of the alpha, found by Newton's method. The alpha is
+/// smoothed by a Gaussian, so that it has derivatives everywhere. [px]
 fn saddle(image: &RgbdImage, start: DVec2) -> DVec2 {
     const SIGMA_PX: f64 = 1.5;
     const HALF: i32 = 6;
@@ -99,7 +99,7 @@ fn saddle(image: &RgbdImage, start: DVec2) -> DVec2 {
     corner
 }
 
-/// Lenses and mountings at which boards are looked at; 640 px wide.
+/// Returns lenses and poses of cameras that see the boards; 640 px wide.
 fn cameras() -> Vec<(&'static str, Camera)> {
     let pinhole = Intrinsics {
         fy_px: 520.0,
@@ -140,7 +140,7 @@ fn cameras() -> Vec<(&'static str, Camera)> {
     cameras
 }
 
-/// Where a point lands by the formula, if that is `margin_px` within the image.
+/// Returns the image of a point by the formula, if it is at least `margin_px` within the image.
 fn lands(camera: &Camera, p_world: DVec3, margin_px: f64) -> Option<DVec2> {
     let k = &camera.intrinsics;
     let pixel = k.project(camera.world_from_cam.inverse().transform_point(p_world))?;
@@ -149,7 +149,7 @@ fn lands(camera: &Camera, p_world: DVec3, margin_px: f64) -> Option<DVec2> {
     inside.then_some(pixel)
 }
 
-/// Fails unless every corner that [`scene`] shows lands where [`Intrinsics::project`] says.
+/// Checks that every corner of [`scene`] is where [`Intrinsics::project`] predicts it.
 pub(crate) fn check_corners(renderer: &mut dyn Rasterizer) {
     for (lens, camera) in cameras() {
         let mut image = [RgbdImage::default()];
@@ -157,7 +157,7 @@ pub(crate) fn check_corners(renderer: &mut dyn Rasterizer) {
         let (mut worst_px, mut seen) = (0f64, 0);
         for corner in corners() {
             let Some(expected) = lands(&camera, corner, 8.0) else { continue };
-            // Squares must be larger than the window in which the corner is sought.
+            // Squares must be larger than the window in which the corner is searched.
             let beside = DVec3::new(0.0, SIDE_M, 0.0);
             let next = lands(&camera, corner + beside, 0.0);
             if next.is_none_or(|next| (next - expected).length() < 13.0) {
@@ -165,7 +165,7 @@ pub(crate) fn check_corners(renderer: &mut dyn Rasterizer) {
             }
             let off_axis = camera.world_from_cam.inverse().transform_point(corner);
             if off_axis.truncate().length() > 3.0 * off_axis.z {
-                // A board seen so much from the side has no square corners; dots go further out.
+                // On a board seen at such a steep angle, corners are not square; dots cover larger angles.
                 continue;
             }
             worst_px = worst_px.max((saddle(&image[0], expected) - expected).length());
@@ -177,8 +177,8 @@ pub(crate) fn check_corners(renderer: &mut dyn Rasterizer) {
     }
 }
 
-/// Dots in all directions up to `MAX_DEG` from the z axis, 1 to 9 m away, each some pixels across for
-/// a lens of `px_per_rad`; apart from each other by many times that.
+/// Returns dots in all directions up to `MAX_DEG` from the z axis, 1 to 9 m away, each some pixels wide for a lens of
+/// `px_per_rad`. Their distances are many times larger.
 fn dots(px_per_rad: f64) -> Splats {
     const MAX_DEG: i32 = 84;
     let mut splats = Splats::default();
@@ -197,15 +197,14 @@ fn dots(px_per_rad: f64) -> Splats {
     splats
 }
 
-/// Fails unless the middle of every dot of `dots` is where the formula says; returns the worst
-/// error. [px]
+/// Checks that the centre of every dot of `dots` is where the formula predicts it. Returns the maximum error. [px]
 fn check_dots(renderer: &mut dyn Rasterizer, dots: &Splats, camera: &Camera) -> f64 {
     let mut image = [RgbdImage::default()];
     renderer.render(&[], &[*camera], &mut image).expect("a valid camera");
     let image = &image[0];
     let (mut worst_px, mut seen) = (0f64, 0);
     for mean in &dots.means_m {
-        // As f32 has it, which is what the scene holds.
+        // Rounded to f32, as in the scene.
         let Some(expected) = lands(camera, mean.as_dvec3(), 9.0) else { continue };
         let (mut sum, mut weight) = (DVec2::ZERO, 0.0);
         let (left, top) = (expected.x as usize - 8, expected.y as usize - 8);
@@ -216,7 +215,7 @@ fn check_dots(renderer: &mut dyn Rasterizer, dots: &Splats, camera: &Camera) -> 
                 weight += alpha;
             }
         }
-        assert!(weight > 1.0, "{}: nothing at {expected}", renderer.name());
+        assert!(weight > 1.0, "{}: no dot at {expected}", renderer.name());
         worst_px = worst_px.max((sum / weight).length());
         seen += 1;
     }
@@ -226,7 +225,7 @@ fn check_dots(renderer: &mut dyn Rasterizer, dots: &Splats, camera: &Camera) -> 
 }
 
 #[test]
-fn corners_of_a_checkerboard_land_where_the_formula_says() {
+fn checkerboard_corners_match_the_formula() {
     let scene = scene();
     for mut renderer in renderers::every(Scene::from(&scene)) {
         check_corners(renderer.as_mut());
@@ -251,7 +250,7 @@ fn dots_match_the_formula_to_the_rim_of_a_fisheye_3840_px_wide() {
     }
 }
 
-/// A wall across the z axis at `z_m`, of splats in many colours.
+/// Returns a wall perpendicular to the z axis at `z_m`, of splats in many colours.
 fn wall(z_m: f32) -> Splats {
     let mut splats = Splats::default();
     for y in -30..=30i16 {
@@ -267,12 +266,12 @@ fn wall(z_m: f32) -> Splats {
     splats
 }
 
-/// Fails unless two cameras side by side, rendered in one call, see a wall shifted by exactly the
-/// disparity, and each sees what it sees when rendered alone, bit for bit.
+/// Checks that two cameras side by side, rendered in one call, see a wall shifted by exactly the disparity, and that
+/// each image is bit-identical to that of a separate call.
 pub(crate) fn check_stereo(make: renderers::Make<'_>) {
     const BASE_M: f64 = 0.065;
     const Z_M: f32 = 2.6;
-    // fx b / z is a whole number: the right image is the left one, shifted, to the last pixel.
+    // fx b / z is a whole number: the right image is exactly the shifted left one.
     let k =
         Intrinsics { fx_px: 320.0, fy_px: 320.0, ..Intrinsics::from_horizontal_fov(160, 120, 1.0) };
     let disparity_px = k.fx_px * BASE_M / f64::from(Z_M);
@@ -297,7 +296,7 @@ pub(crate) fn check_stereo(make: renderers::Make<'_>) {
         for (camera, image) in cameras.iter().zip(&together) {
             let mut alone = [RgbdImage::default()];
             renderer.render(&[], &[*camera], &mut alone).expect("a valid camera");
-            assert!(alone[0] == *image, "{name}: alone another image than together");
+            assert!(alone[0] == *image, "{name}: image differs between one camera and two");
         }
         let shift = 8;
         for y in 0..120 {
@@ -320,6 +319,6 @@ pub(crate) fn check_stereo(make: renderers::Make<'_>) {
 }
 
 #[test]
-fn a_stereo_pair_is_exact() {
+fn stereo_disparity_is_exact() {
     check_stereo(&renderers::every);
 }

@@ -1,26 +1,26 @@
-//! What f32 leaves open. Where its mean is decides whether a splat is rendered at all: before the
-//! near plane or behind it, within the lens's reach or beyond. Within f32's rounding of such a cut
-//! a fast renderer may decide otherwise than the reference: all of the splat is there, or none.
+//! Ambiguity of f32 at cuts. The position of its mean determines whether a splat is rendered: in front of the near
+//! plane or behind it, within the reach of the lens or beyond. Within the rounding of f32 of such a cut, a fast
+//! renderer may differ from the reference: it renders the complete splat, or omits it.
 
 use glam::{DMat3, DVec3, Vec3};
 use vizflyt_protocol::geometry::{Cam, Frame, Pose};
 use vizflyt_splat::{Camera, Placement, RgbdImage, Scene, Splats, render_reference};
 
-/// What one operation in f32 is off by, relative.
+/// Relative error of one operation in f32.
 const ROUNDING: f64 = f32::EPSILON as f64 / 2.0;
-/// Fast renderers widen the reach by this share, so that what lies on it is rendered.
+/// Fast renderers widen the reach by this share, so that splats exactly at the reach are rendered.
 const WIDENED: f64 = 1e-6;
-/// How many splats on cuts are tried in every combination. One random scene in a thousand has one.
+/// Maximum number of splats on cuts, all combinations of which are tried. One random scene in a thousand has one.
 const MAX_ON_CUTS: usize = 4;
 
-/// Returns the reference's image; where splats are on a cut, one for every choice of those shown.
+/// Returns the image of the reference; with splats on a cut, one image for every combination of them.
 pub(crate) fn references<'a>(
     scene: impl Into<Scene<'a>>,
     placements: &[Placement],
     camera: &Camera,
 ) -> Vec<RgbdImage> {
     let scene = scene.into();
-    // Part, splat, and where the reference shows it.
+    // Part, splat, and the mean with which the reference renders it.
     let mut on_cuts: Vec<(usize, usize, Vec3)> = Vec::new();
     let mut look = |part: usize, splats: &Splats, cuts: &Cuts| {
         let found = (0..splats.len()).filter(|&i| cuts.are_near(splats.means_m[i]));
@@ -50,7 +50,7 @@ pub(crate) fn references<'a>(
     (0..1 << on_cuts.len()).map(choose).collect()
 }
 
-/// The cuts of a camera, as one part of the scene sees it.
+/// Cuts of a camera, relative to one part of the scene.
 struct Cuts {
     cam_from_part: DMat3,
     center_m: DVec3,
@@ -74,26 +74,26 @@ impl Cuts {
         (p.z, p.truncate().length() / p.z)
     }
 
-    /// Whether f64 shows a splat with this mean.
+    /// Returns whether f64 renders a splat with this mean.
     fn show(&self, mean_m: Vec3) -> bool {
         let (z, slope) = self.place(mean_m);
         z > self.near_m && slope <= self.reach
     }
 
-    /// Whether f32 may decide otherwise.
+    /// Returns whether the result of f32 may differ.
     fn are_near(&self, mean_m: Vec3) -> bool {
         let (z, slope) = self.place(mean_m);
-        // In f32 the camera's centre, the difference, the rotation and three terms are rounded.
+        // In f32, the camera's centre, the difference, the rotation and three terms are rounded.
         let distance_m = (mean_m.as_dvec3() - self.center_m).length();
         let off_m = ROUNDING * (self.center_m.length() + 5.0 * distance_m);
-        // Then the slope's division, product and square, and the reach.
+        // Then the division, product and square of the slope, and the reach.
         let off = (WIDENED + 5.0 * ROUNDING) * slope + off_m * (1.0 + slope) / z;
         z > self.near_m - off_m
             && slope <= self.reach + off
             && (z <= self.near_m + off_m || slope >= self.reach - off)
     }
 
-    /// Returns the mean, or the next place ahead that f64 shows: forward is away from every cut.
+    /// Returns the mean, or the next point ahead of it that f64 renders: moving forward leaves every cut.
     fn inside(&self, mean_m: Vec3) -> Vec3 {
         let forward = self.cam_from_part.row(2);
         let step_m = ROUNDING * (mean_m.as_dvec3() - self.center_m).length();

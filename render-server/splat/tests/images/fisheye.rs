@@ -1,7 +1,6 @@
-//! How good is a wide lens? A Gaussian is linearised where its middle is, so what is large in
-//! angle is rendered as an ellipse that it is not. The truth here is brute force: every pixel is rendered
-//! alone, by a narrow pinhole camera that looks straight along its ray, where all of that hardly
-//! matters.
+//! Accuracy of wide lenses. A Gaussian is linearised at its centre, so a splat with a large angular size is rendered
+//! as an ellipse with the wrong shape. The reference is brute force: every pixel is rendered separately, by a narrow
+//! pinhole camera that looks straight along its ray, for which this error is negligible.
 
 use glam::{DMat3, DQuat, DVec2, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose};
@@ -9,21 +8,21 @@ use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
 use crate::compare;
 
-/// Side of the pinhole image of which only the middle pixel counts: a splat that reaches it has
-/// its middle within, so that it is not clamped. [px]
+/// Side of the pinhole image of which only the middle pixel is used. The centre of a splat that reaches this pixel is
+/// within the image, so that its linearisation is not clamped. [px]
 const PATCH: u32 = 15;
 
-/// Slope up to which pixels count, 80 degrees. At 89 the lens ends for us, and what has its middle
-/// beyond is not rendered; the splats of these tests reach some degrees inwards from there.
+/// Maximum slope of compared pixels, 80 degrees. The lens model ends at 89 degrees, and splats with centres beyond it
+/// are not rendered; the splats of these tests extend some degrees inwards from there.
 const RIM: f64 = 5.671;
 
-/// The slope of the ray through pixel `i`, if it counts.
+/// Returns the slope of the ray through pixel `i`, if the pixel is compared.
 fn slope(k: &Intrinsics, i: usize) -> Option<DVec2> {
     let (x, y) = (i % k.width_px as usize, i / k.width_px as usize);
     k.slope(DVec2::new(x as f64 + 0.5, y as f64 + 0.5)).filter(|slope| slope.length() < RIM)
 }
 
-/// Renders colour and alpha pixel by pixel, of those that count.
+/// Renders colour and alpha of the compared pixels one by one.
 fn brute_force(renderer: &mut dyn Rasterizer, camera: &Camera) -> RgbdImage {
     let k = &camera.intrinsics;
     let mut image = RgbdImage::default();
@@ -31,11 +30,11 @@ fn brute_force(renderer: &mut dyn Rasterizer, camera: &Camera) -> RgbdImage {
     let mut patch = [RgbdImage::default()];
     for i in 0..k.pixels() {
         let Some(slope) = slope(k, i) else { continue };
-        // Axes: along the ray, away from the lens's axis, around it.
+        // Axes: along the ray, away from the axis of the lens, around it.
         let z = slope.extend(1.0).normalize();
         let x = slope.normalize_or(DVec2::X).extend(0.0).reject_from(z).normalize();
         let y = z.cross(x);
-        // Pixels per radian along each.
+        // Pixels per radian along each axis.
         let (_, bend) = k.distortion.distort(slope);
         let px_per_rad = |axis: DVec3| {
             let slope_per_rad = (axis.truncate() - slope * axis.z) / z.z;
@@ -64,7 +63,7 @@ fn brute_force(renderer: &mut dyn Rasterizer, camera: &Camera) -> RgbdImage {
     image
 }
 
-/// Colour and alpha of a camera against the truth. [dB]
+/// Returns the similarity of colour and alpha of a camera to the reference. [dB]
 fn measure(name: &str, splats: &Splats, intrinsics: Intrinsics) -> [f64; 2] {
     let camera = Camera::new(
         intrinsics,
@@ -85,12 +84,12 @@ fn measure(name: &str, splats: &Splats, intrinsics: Intrinsics) -> [f64; 2] {
     }
     let db = [(&image.rgb, &truth.rgb), (&image.alpha, &truth.alpha)]
         .map(|(a, b)| compare::psnr_db(a, b));
-    println!("{name}: rgb {:.1} dB, alpha {:.1} dB against the truth", db[0], db[1]);
+    println!("{name}: rgb {:.1} dB, alpha {:.1} dB against the reference", db[0], db[1]);
     db
 }
 
 fn fisheye(width_px: u32, height_px: u32, fov_deg: f64) -> Intrinsics {
-    // Equidistant: the radius is the angle.
+    // Equidistant: the radius is proportional to the angle.
     let f_px = f64::from(width_px) / fov_deg.to_radians();
     Intrinsics {
         fx_px: f_px,
@@ -100,7 +99,7 @@ fn fisheye(width_px: u32, height_px: u32, fov_deg: f64) -> Intrinsics {
     }
 }
 
-/// The inside of a room, 6 x 4 x 3 m, covered with flat splats of `size_m`, coloured in patches.
+/// Returns the inside of a room, 6 x 4 x 3 m, covered with flat splats of `size_m`, coloured in patches.
 fn room(size_m: f32) -> Splats {
     let mut splats = Splats::default();
     let half = Vec3::new(3.0, 1.5, 2.0);
@@ -130,7 +129,7 @@ fn room(size_m: f32) -> Splats {
 }
 
 #[test]
-fn wide_lenses_come_near_a_pinhole_of_90_degrees() {
+fn wide_lenses_are_almost_as_accurate_as_a_pinhole_of_90_degrees() {
     let pinhole = Intrinsics::from_horizontal_fov(64, 48, 90f64.to_radians());
     let barrel = Distortion::BrownConrady { k1: -0.25, k2: 0.06, p1: 0.0, p2: 0.0, k3: -0.005 };
     for size_m in [0.05, 0.15] {
@@ -144,9 +143,9 @@ fn wide_lenses_come_near_a_pinhole_of_90_degrees() {
         ];
         for (name, intrinsics) in lenses {
             let [rgb_db, alpha_db] = measure(&format!("{size_m} m, {name}"), &splats, intrinsics);
-            // 5 dB: what overlaps is rendered in the order of z; at 80 degrees that is less the order
-            // along the ray than it is at 45. (By distance all lenses would reach 40 to 57 dB, as
-            // the truth does order, nearly; alpha, which knows no order, shows the rest.)
+            // 5 dB less: overlapping splats are blended in the order of z, which at 80 degrees differs more from the
+            // order along the ray than at 45. Sorted by distance, all lenses would reach 40 to 57 dB, because the
+            // reference's order is almost that. Alpha, which does not depend on the order, shows the remaining error.
             assert!(rgb_db > usual_db - 5.0, "{size_m} m, {name}: {rgb_db} dB, not {usual_db}");
             assert!(alpha_db > 45.0, "{size_m} m, {name}: alpha {alpha_db} dB");
         }

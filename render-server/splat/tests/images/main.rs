@@ -1,4 +1,4 @@
-//! What renderers produce: against an independent oracle, against each other, and of poisoned input.
+//! Images of the renderers, compared with an independent oracle, with each other, and for invalid input.
 
 mod agreement;
 mod compare;

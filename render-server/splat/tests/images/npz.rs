@@ -7,8 +7,7 @@ use std::path::Path;
 
 use flate2::read::DeflateDecoder;
 
-/// Returns the little-endian float32 arrays of an archive by name, flattened; other types are left
-/// out.
+/// Returns the little-endian float32 arrays of an archive by name, flattened; skips other types.
 pub(crate) fn read(path: &Path) -> HashMap<String, Vec<f32>> {
     let bytes = std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     let u16_at = |at: usize| usize::from(u16::from_le_bytes([bytes[at], bytes[at + 1]]));

@@ -1,4 +1,4 @@
-//! Rigid objects: rendered where they are placed, hidden by what is nearer, and named by their ids.
+//! Rigid objects: rendered at their placement, hidden by nearer surfaces, and identified by their ids.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
@@ -55,9 +55,9 @@ proptest! {
 proptest! {
     #![proptest_config(cases(32))]
 
-    /// Depth alone: median depths and ids to the bit, from image to image, on every instruction set.
+    /// Depth-only mode: median depths and ids are bit-identical in consecutive images, on every instruction set.
     #[test]
-    fn depth_alone_is_the_same_depth(
+    fn depth_only_mode_gives_the_same_depth(
         still in splats(0..300),
         objects in objects(),
         cameras in prop::collection::vec(camera(), 1..3),
@@ -85,7 +85,7 @@ proptest! {
     }
 }
 
-/// A square wall of opaque splats across the z axis of its own frame.
+/// Returns a square wall of opaque splats, perpendicular to the z axis of its own frame.
 fn wall(z_m: f32, half_m: f32, colour: f32) -> Splats {
     let mut splats = Splats::default();
     for y in -20..=20i16 {
@@ -106,7 +106,7 @@ fn ahead() -> Camera {
 }
 
 #[test]
-fn a_door_before_a_wall_hides_it_and_is_named() {
+fn object_hides_the_wall_behind_it_and_sets_the_id() {
     let still = wall(4.0, 3.0, 0.2);
     let door = [RigidObject { id: 7, splats: wall(0.0, 0.5, 0.9) }];
     let scene = Scene { splats: &still, objects: &door };
@@ -129,7 +129,7 @@ fn a_door_before_a_wall_hides_it_and_is_named() {
 }
 
 #[test]
-fn invalid_placement_is_refused() {
+fn rejects_an_invalid_placement() {
     let still = wall(4.0, 3.0, 0.2);
     let door = [RigidObject { id: 7, splats: wall(0.0, 0.5, 0.9) }];
     let scene = Scene { splats: &still, objects: &door };

@@ -1,10 +1,10 @@
-//! Against an independent float64 oracle.
+//! Comparison with an independent float64 oracle.
 //!
-//! `tests/data` holds small scenes with the oracle's images; `make_references.py` there made them.
-//! Where the repository has a neighbour `../shared/scenes`, its captured scenes are compared too.
+//! `tests/data` contains small scenes with the images of the oracle, created by `make_references.py` there. If the
+//! repository has a neighbour `../shared/scenes`, its captured scenes are compared too.
 //!
-//! Limits: 60 dB of RGB and alpha, depths within 1e-3 on 99.5 % of pixels. Single pixels flip at
-//! the thresholds of f32 (alpha 1/255, transmittance 1e-4 and 1/2), so maxima are meaningless.
+//! Limits: 60 dB of RGB and alpha, depths within 1e-3 on 99.5 % of pixels. Single pixels flip at the thresholds of
+//! f32 (alpha 1/255, transmittance 1e-4 and 1/2), so maxima are not compared.
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +16,7 @@ use vizflyt_splat::{Atmosphere, Camera, RgbdImage, Scene, Splats, ply, render_re
 use crate::renderers::{self, Make};
 use crate::{compare, npz};
 
-/// A camera as the oracle writes it: pixel centres at +0.5, `w2c` row-major world to camera.
+/// Camera in the oracle's format: pixel centres at +0.5, `w2c` is the row-major world-to-camera matrix.
 #[derive(Deserialize)]
 struct OracleCamera {
     fx: f64,
@@ -84,7 +84,7 @@ fn check(name: &str, renderer: &str, actual: &RgbdImage, expected: &RgbdImage) {
 
 /// Compares renderers with the references `cases`: (camera file, image file).
 fn check_scene(make: Make<'_>, splats: &Splats, cases: &[(PathBuf, PathBuf)]) {
-    assert!(!cases.is_empty(), "no references");
+    assert!(!cases.is_empty(), "no reference images found");
     let mut renderers = make(Scene::from(splats));
     for (camera_file, image_file) in cases {
         let camera = camera(camera_file);
@@ -98,7 +98,7 @@ fn check_scene(make: Make<'_>, splats: &Splats, cases: &[(PathBuf, PathBuf)]) {
     }
 }
 
-/// Generated scenes of every degree, as if they had been trained with anti-aliasing.
+/// Checks generated scenes of every degree, rendered as if they had been trained with anti-aliasing.
 pub(crate) fn check_antialiased_scenes(make: Make<'_>) {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
     for degree in 0..=3 {
@@ -106,14 +106,14 @@ pub(crate) fn check_antialiased_scenes(make: Make<'_>) {
         let splats = Splats { antialiased: true, ..loaded.splats };
         let view = |end: &str| data.join(format!("sh{degree}_a{end}"));
         check_scene(make, &splats, &[(view(".json"), view("_antialiased.npz"))]);
-        // It is not the classic image.
+        // It must differ from the classic image.
         let expected = |end: &str| oracle_image(&view(end), &camera(&view(".json")));
         let d = compare::difference(&expected(".npz"), &expected("_antialiased.npz"));
         assert!(d.rgb_db < 40.0 && d.alpha_db < 40.0, "degree {degree}: {d:?}");
     }
 }
 
-/// Generated scenes of every degree.
+/// Checks generated scenes of every degree.
 pub(crate) fn check_generated_scenes(make: Make<'_>) {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
     for degree in 0..=3u8 {
@@ -127,7 +127,7 @@ pub(crate) fn check_generated_scenes(make: Make<'_>) {
     }
 }
 
-/// Captured scenes, where they are.
+/// Checks captured scenes, if they are present.
 pub(crate) fn check_captured_scenes(make: Make<'_>) {
     let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/scenes");
     for scene in ["room", "flowers_lod2"] {
@@ -161,9 +161,10 @@ fn antialiased_scenes_match_the_oracle() {
     check_antialiased_scenes(&renderers::every);
 }
 
-/// The plain renderer is what [`check_antialiased_scenes`] holds against the oracle; here every other one against it.
+/// [`check_antialiased_scenes`] compares the reference renderer with the oracle; this test compares all others with
+/// it.
 #[test]
-fn antialiased_captured_scenes_match_the_plain_renderer() {
+fn antialiased_captured_scenes_match_the_reference() {
     let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/scenes");
     for scene in ["room", "flowers_lod2"] {
         let file = shared.join(scene).with_extension("ply");

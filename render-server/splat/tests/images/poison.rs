@@ -1,6 +1,6 @@
 //! Input at and beyond the limits: clean images or precise errors, never NaN, never a panic.
 //!
-//! Each check takes the renderers that it is made of, so that it can be called with others.
+//! Each check takes the renderers as a parameter, so that it can be used for any of them.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
@@ -33,13 +33,13 @@ fn looking_ahead(width_px: u32, height_px: u32, fov_deg: f64) -> Camera {
     }
 }
 
-/// The same field of view through a pinhole, a barrel lens and a fisheye.
+/// Returns cameras with the same field of view through a pinhole, a barrel lens and a fisheye.
 fn through_lenses(width_px: u32, height_px: u32, fov_deg: f64) -> [Camera; 3] {
     let camera = looking_ahead(width_px, height_px, fov_deg);
     let half_rad = 0.5 * fov_deg.to_radians();
     let barrel = Distortion::BrownConrady { k1: -0.2, k2: 0.05, p1: 1e-3, p2: -1e-3, k3: -0.002 };
     let fisheye = Distortion::KannalaBrandt { k1: 0.01, k2: -0.002, k3: 0.0, k4: 0.0 };
-    // As far as the barrel lens sees, and as the fisheye puts angles on the radius.
+    // Limited to the reach of the barrel lens; for the fisheye, from the angle.
     let within = half_rad.tan().min(0.95 * barrel.reach());
     [(Distortion::None, half_rad.tan()), (barrel, within), (fisheye, half_rad.tan())].map(
         |(distortion, slope)| {
@@ -51,7 +51,7 @@ fn through_lenses(width_px: u32, height_px: u32, fov_deg: f64) -> [Camera; 3] {
     )
 }
 
-/// Renders with everything there is; all images are clean.
+/// Renders with all renderers; checks that all images are clean.
 fn render_all(make: Make<'_>, splats: &Splats, camera: &Camera) -> Vec<(String, RgbdImage)> {
     let mut images = Vec::new();
     for mut renderer in make(Scene::from(splats)) {
@@ -69,7 +69,7 @@ fn size(camera: &Camera) -> (u32, u32) {
     (camera.intrinsics.width_px, camera.intrinsics.height_px)
 }
 
-/// Scales from nothing to all there is, opacities from none to full.
+/// Scales from 0 to infinity, opacities from 0 to 1.
 pub(crate) fn check_scales_and_opacities(make: Make<'_>) {
     let cameras = through_lenses(32, 24, 70.0);
     for scale in [0.0, 1e-38, 1e-30, 1e-4, 1.0, 1e4, 1e30, f32::MAX, f32::INFINITY] {
@@ -94,7 +94,7 @@ pub(crate) fn check_scales_and_opacities(make: Make<'_>) {
     }
 }
 
-/// Values that are not finite, and invalid rotations, are left out.
+/// Values that are not finite and invalid rotations are dropped.
 pub(crate) fn check_what_is_not_finite(make: Make<'_>) {
     let good = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.3), 0.8);
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
@@ -119,7 +119,7 @@ pub(crate) fn check_what_is_not_finite(make: Make<'_>) {
     }
 }
 
-/// What files hold before it is activated: infinite logits, logarithms, quaternions of any length.
+/// File contents before activation: infinite logits, logarithms, quaternions of any length.
 pub(crate) fn check_files(make: Make<'_>) {
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.3), 0.8);
     let file = ply::encode(&splats);
@@ -136,13 +136,13 @@ pub(crate) fn check_files(make: Make<'_>) {
         }
         match ply::parse(&bytes) {
             Ok(loaded) => loaded.splats,
-            // The reader left it out itself.
+            // The reader has already dropped it.
             Err(ply::PlyError::Empty { declared: 1, dropped: 1 }) => Splats::default(),
             Err(other) => panic!("{changes:?}: {other}"),
         }
     };
     let rotations = ["rot_0", "rot_1", "rot_2", "rot_3"];
-    // What changes, and whether the splat is there afterwards.
+    // Changed values, and whether the splat is visible afterwards.
     let mut cases: Vec<(Vec<(&str, f32)>, bool)> = vec![
         (vec![("opacity", f32::INFINITY)], true),
         (vec![("opacity", f32::NEG_INFINITY)], false),
@@ -183,12 +183,12 @@ pub(crate) fn check_distances(make: Make<'_>) {
                 }
             }
         }
-        // Inside a splat: the camera sees what of it lies beyond the near plane.
+        // Inside a splat: the part beyond the near plane is visible.
         let around = one(Vec3::new(0.0, 0.0, 0.06), Vec3::splat(3.0), 0.9);
         for (name, image) in render_all(make, &around, &camera) {
             assert!(image.alpha.iter().all(|&alpha| alpha > 0.85), "{name}");
         }
-        // Its middle is where the camera is, or behind: a splat is where its middle is.
+        // Splats are culled by their centre: at the camera or behind it, they are not rendered.
         for z in [0.0, -0.5] {
             let around = one(Vec3::new(0.0, 0.0, z), Vec3::splat(3.0), 0.9);
             for (name, image) in render_all(make, &around, &camera) {
@@ -206,7 +206,7 @@ pub(crate) fn check_sizes_and_fields_of_view(make: Make<'_>) {
             for camera in through_lenses(width, height, fov_deg) {
                 for (name, image) in render_all(make, &splats, &camera) {
                     let middle = (height / 2 * width + width / 2) as usize;
-                    // Over a single column 200 px high the fisheye of 170 degrees is one splat wide.
+                    // In a single column 200 px high, the fisheye of 170 degrees is one splat wide.
                     assert!(image.alpha[middle] > 0.05, "{name}: {camera:?}");
                 }
             }
@@ -214,7 +214,7 @@ pub(crate) fn check_sizes_and_fields_of_view(make: Make<'_>) {
     }
 }
 
-/// 3840 x 2160, through all lenses.
+/// Maximum size of 3840 x 2160, through all lenses.
 pub(crate) fn check_the_largest_size(make: Make<'_>) {
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);
     for camera in through_lenses(3840, 2160, 90.0) {
@@ -224,7 +224,7 @@ pub(crate) fn check_the_largest_size(make: Make<'_>) {
     }
 }
 
-/// Nothing to see is the background.
+/// Empty scenes show the background.
 pub(crate) fn check_empty_scenes(make: Make<'_>) {
     let transparent = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.001);
     for splats in [Splats::default(), transparent] {
@@ -237,7 +237,7 @@ pub(crate) fn check_empty_scenes(make: Make<'_>) {
     }
 }
 
-/// Invalid cameras are refused by name, and no image is touched.
+/// Invalid cameras are rejected with a specific error, and no image is changed.
 pub(crate) fn check_cameras_that_are_none(make: Make<'_>) {
     let good = looking_ahead(20, 10, 60.0);
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);
@@ -248,7 +248,7 @@ pub(crate) fn check_cameras_that_are_none(make: Make<'_>) {
             let message = refused.expect_err("an invalid camera").to_string();
             assert!(message.contains(part), "{}: {message:?} lacks {part:?}", renderer.name());
             assert_eq!(untouched[0], RgbdImage::default());
-            // The next is rendered.
+            // The next valid call is rendered.
             renderer.render(&[], &[good], &mut untouched).expect("a valid camera");
         }
     };
@@ -288,7 +288,7 @@ fn extreme_scales_and_opacities_stay_clean_and_agree() {
 
 #[test]
 fn splats_that_are_not_finite_are_dropped() {
-    // Not of the reference, which takes what it is given.
+    // Without the reference, which does not filter its input.
     check_what_is_not_finite(&renderers::cpus);
 }
 
@@ -298,30 +298,30 @@ fn extreme_values_in_files_leave_images_finite() {
 }
 
 #[test]
-fn distances_from_behind_to_far_stay_clean() {
+fn images_stay_clean_from_behind_the_camera_to_far_away() {
     check_distances(&renderers::every);
 }
 
 #[test]
-fn every_size_and_field_of_view_is_rendered() {
+fn renders_every_size_and_field_of_view() {
     check_sizes_and_fields_of_view(&renderers::every);
     check_the_largest_size(&renderers::cpus);
 }
 
 #[test]
-fn a_scene_without_splats_is_the_background() {
+fn scene_without_splats_shows_the_background() {
     check_empty_scenes(&renderers::every);
 }
 
 #[test]
-fn invalid_cameras_are_refused() {
+fn rejects_invalid_cameras() {
     check_cameras_that_are_none(&renderers::every);
 }
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Any bits at all in a scene, any camera: clean images.
+    /// Arbitrary bits in a scene, and any camera: clean images.
     #[test]
     fn any_bits_give_clean_images(
         mut splats in agreement::splats(1..80),

@@ -1,4 +1,4 @@
-//! All renderers behind one contract, so that a check is written once.
+//! All renderers behind one interface, so that each check is written once.
 
 use std::borrow::Cow;
 
@@ -7,10 +7,10 @@ use vizflyt_splat::{
     Scene, Splats, Workload, render_reference,
 };
 
-/// Packs a scene for each of some renderers. A check that takes this can be called with others.
+/// Packs a scene for several renderers. A check with this parameter can be used for any of them.
 pub(crate) type Make<'a> = &'a dyn Fn(Scene<'_>) -> Vec<Box<dyn Rasterizer>>;
 
-/// The plain renderer, as a [`Rasterizer`].
+/// Reference renderer as a [`Rasterizer`].
 struct Reference {
     splats: Splats,
     objects: Vec<RigidObject>,
@@ -39,7 +39,7 @@ impl Rasterizer for Reference {
     }
 }
 
-/// Returns the reference alone.
+/// Returns only the reference.
 pub(crate) fn reference(scene: Scene<'_>) -> Vec<Box<dyn Rasterizer>> {
     vec![Box::new(Reference { splats: scene.splats.clone(), objects: scene.objects.to_vec() })]
 }

@@ -1,5 +1,5 @@
-//! The unit tests of the instruction sets once more, beside the images: `tests/arm/run` has both built for ARM64 then,
-//! without all the unit tests of the crate.
+//! Unit tests of the instruction sets, repeated next to the image tests: `tests/arm/run` can then build both for
+//! ARM64 without all unit tests of the crate.
 
 use vizflyt_splat::simd::{InstructionSet, Kernel, Simd};
 

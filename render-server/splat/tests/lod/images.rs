@@ -1,4 +1,4 @@
-//! Images with coarser levels against images of every splat.
+//! Compares images in adaptive detail with images of every splat.
 
 use std::path::Path;
 
@@ -39,7 +39,7 @@ fn render_all(
 }
 
 #[test]
-fn a_city_from_afar_looks_the_same_for_less() {
+fn distant_city_is_similar_with_fewer_splats() {
     for sh_degree in [0, 1] {
         let splats = city(300_000, 3, sh_degree);
         let mut full = CpuRenderer::new(&splats);
@@ -66,11 +66,11 @@ fn a_city_from_afar_looks_the_same_for_less() {
     }
 }
 
-/// What [`Detail::ADAPTIVE`] promises of a view with so many splats in sight.
+/// Checks the limits of [`Detail::ADAPTIVE`] for a view with `visible` splats.
 fn assert_promise(what: &str, image: &RgbdImage, truth: &RgbdImage, visible: usize) {
     let likeness = Likeness::of(image, truth);
     let per_pixel = visible as f64 / truth.alpha.len() as f64;
-    println!("{what}, {per_pixel:.1} splats a pixel: {likeness}");
+    println!("{what}, {per_pixel:.1} splats per pixel: {likeness}");
     if per_pixel <= 15.0 {
         assert!(likeness.rgb_db >= 37.0 && likeness.alpha_db >= 37.0, "{what}: {likeness}");
         assert!(likeness.rgb_off <= 0.04 && likeness.median_off <= 0.06, "{what}: {likeness}");
@@ -79,7 +79,8 @@ fn assert_promise(what: &str, image: &RgbdImage, truth: &RgbdImage, visible: usi
     assert!(likeness.rgb_db >= 30.0 || per_pixel > 100.0, "{what}: {likeness}");
 }
 
-/// Returns a camera that sees the same in fewer pixels: as if everything were smaller, and as much of it.
+/// Returns a camera with the same field of view and fewer pixels: the scene appears smaller, with the same number of
+/// splats.
 fn shrunk(k: &Intrinsics, share: f64) -> Intrinsics {
     let size = |px: u32| (f64::from(px) * share).round() as u32;
     Intrinsics {
@@ -93,7 +94,8 @@ fn shrunk(k: &Intrinsics, share: f64) -> Intrinsics {
     }
 }
 
-/// The views of a scene in smaller and smaller pictures, held to the promise; returns how many splats were rendered, of how many.
+/// Renders the views of a scene in smaller and smaller images, and checks the limits. Returns the number of rendered
+/// splats, and the number in full detail.
 fn check_promise(what: &str, splats: &Splats, cameras: &[Camera]) -> (usize, usize) {
     let mut full = CpuRenderer::new(splats);
     let mut adaptive = CpuRenderer::with_detail(splats, Detail::ADAPTIVE);
@@ -112,7 +114,7 @@ fn check_promise(what: &str, splats: &Splats, cameras: &[Camera]) -> (usize, usi
 }
 
 #[test]
-fn a_captured_lawn_keeps_the_promise() {
+fn lawn_meets_the_limits_of_adaptive_detail() {
     for antialiased in [false, true] {
         let splats = Splats { antialiased, ..lawn(150_000) };
         let side_m = f64::from(SIDE_M);
@@ -129,7 +131,7 @@ fn a_captured_lawn_keeps_the_promise() {
 }
 
 #[test]
-fn captured_scenes_keep_the_promise() {
+fn captured_scenes_meet_the_limits_of_adaptive_detail() {
     let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/scenes");
     for scene in ["room", "flowers_lod2"] {
         let file = shared.join(scene).with_extension("ply");
@@ -150,7 +152,7 @@ fn captured_scenes_keep_the_promise() {
 }
 
 #[test]
-fn less_error_allowed_is_less_error() {
+fn smaller_allowed_error_gives_smaller_error() {
     let splats = city(60_000, 3, 0);
     let camera = look(DVec3::new(-110.0, -90.0, 60.0), DVec3::ZERO);
     let (truth, all) = render_all(&mut CpuRenderer::new(&splats), &[], &camera);
@@ -163,7 +165,7 @@ fn less_error_allowed_is_less_error() {
         before = (rgb_db, visible);
     }
     assert!(before.1 < all);
-    // None allowed: none made.
+    // No allowed error: nothing is merged.
     for max_error_px in [0.0, -1.0, f32::NAN] {
         let mut renderer = CpuRenderer::with_detail(&splats, Detail::Adaptive { max_error_px });
         let (image, visible) = render_all(&mut renderer, &[], &camera);
@@ -172,9 +174,9 @@ fn less_error_allowed_is_less_error() {
 }
 
 #[test]
-fn near_splats_are_rendered_in_full() {
+fn near_splats_are_rendered_in_full_detail() {
     let splats = city(60_000, 3, 1);
-    // A street's end: nothing in view is small.
+    // End of a street: nothing in view is small.
     let camera = look(DVec3::new(-22.0, -20.0, 1.6), DVec3::new(-20.0, -15.0, 1.2));
     let near = Camera { intrinsics: Intrinsics::from_horizontal_fov(320, 240, 0.4), ..camera };
     let (truth, _) = render_all(&mut CpuRenderer::new(&splats), &[], &near);
@@ -197,7 +199,7 @@ fn packing_and_rendering_again_give_the_same_bytes() {
     }
 }
 
-/// A ball of small splats: an object that is one pixel wide, or all there is to see.
+/// Returns a ball of small splats: an object that is one pixel wide, or fills the view.
 fn ball(count: usize) -> Splats {
     let random = &mut crate::city::Random::new(5);
     let mut splats = Splats::default();
@@ -214,7 +216,7 @@ fn ball(count: usize) -> Splats {
 }
 
 #[test]
-fn objects_have_levels_of_their_own() {
+fn objects_have_separate_levels() {
     let still = city(20_000, 2, 0);
     let objects = [
         RigidObject { id: 3, splats: ball(20_000) },
@@ -226,7 +228,7 @@ fn objects_have_levels_of_their_own() {
     let at = |x_m: f64, y_m: f64| {
         Some(Pose::new(DVec3::new(x_m, y_m, 3.0), DQuat::from_rotation_z(x_m)))
     };
-    // One right before the camera, one far away.
+    // One object close to the camera, one far away.
     let placements = [at(-28.0, 0.6), at(-5.0, -2.0), at(-27.0, 0.0)];
     let (truth, all) = render_all(&mut CpuRenderer::new(scene), &placements, &camera);
     let mut renderer = CpuRenderer::with_detail(scene, Detail::ADAPTIVE);
@@ -239,7 +241,7 @@ fn objects_have_levels_of_their_own() {
         let (a, b) = (count(&image, id), count(&truth, id));
         assert!(b > 0 && a.abs_diff(b) <= 1 + b / 50, "object {id}: {a} and {b} pixels");
     }
-    // Gone again.
+    // The objects are absent again.
     let (image, _) = render_all(&mut renderer, &[None, None, None], &camera);
     assert!(image.ids.iter().all(|&id| id == 0));
 }

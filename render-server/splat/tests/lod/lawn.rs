@@ -1,19 +1,20 @@
-//! A lawn as a capture has it: where a city is even walls, this is layers of leaves, each of another colour, many fainter
-//! than a hand's breadth is wide, and thin things that stand before them. What is hardest to merge.
+//! Generated lawn that resembles a capture. While a city consists of even walls, this scene has layers of leaves in
+//! different colours, many faint splats less than 10 cm wide, and thin objects in front of them: the most difficult
+//! case for merging.
 
 use glam::{Quat, Vec3};
 use vizflyt_splat::Splats;
 
 use crate::city::Random;
 
-/// Side of the lawn, whose middle is the origin. [m]
+/// Side of the lawn, which is centred at the origin. [m]
 pub(crate) const SIDE_M: f32 = 12.0;
 
-/// Returns `count` splats, z up: a lawn, and stakes in it.
+/// Returns `count` splats, z up: a lawn with stakes.
 pub(crate) fn lawn(count: usize) -> Splats {
     let random = &mut Random::new(11);
     let mut splats = Splats { sh_degree: 1, ..Splats::default() };
-    // So that more splats are smaller ones, of the same total area.
+    // More splats are smaller, with the same total area.
     let size = (100_000.0 / count as f32).sqrt();
     for i in 0..count {
         let mut within = |low, high| random.range(low, high);

@@ -1,21 +1,21 @@
-//! How like two images are.
+//! Similarity of two images.
 
 use std::fmt;
 
 use vizflyt_splat::RgbdImage;
 
-/// An image against the one it should be.
+/// Similarity of an image to its reference.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Likeness {
-    /// Of RGB, 1 being the peak. [dB]
+    /// Peak signal-to-noise ratio of RGB, for a peak of 1. [dB]
     pub(crate) rgb_db: f64,
-    /// Of alpha. [dB]
+    /// Peak signal-to-noise ratio of alpha. [dB]
     pub(crate) alpha_db: f64,
-    /// Share of the pixels with truth's alpha > 0.5 whose median depth is off by more than 1 %.
+    /// Share of the pixels with reference alpha > 0.5 and a median depth off by more than 1 %.
     pub(crate) median_off: f64,
-    /// Share whose expected depth is.
+    /// Share of the same pixels with an expected depth off by more than 1 %.
     pub(crate) expected_off: f64,
-    /// Share of the pixels of which a channel is off by more than 8 of 255.
+    /// Share of the pixels with a channel off by more than 8 of 255.
     pub(crate) rgb_off: f64,
     /// Share of the opaque pixels (alpha > 0.95) that lost more than 0.1 of alpha: holes.
     pub(crate) holes: f64,

@@ -1,4 +1,4 @@
-//! Level of detail: like full detail, for less.
+//! Level of detail: images similar to full detail, at lower cost.
 
 #[path = "../../benches/detail/city.rs"]
 mod city;

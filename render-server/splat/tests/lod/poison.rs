@@ -1,4 +1,4 @@
-//! Scenes at the limits of merging: clean images, close to those of full detail.
+//! Scenes at the limits of merging: clean images, similar to those of full detail.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
@@ -9,7 +9,7 @@ use crate::likeness::Likeness;
 
 const COUNT: usize = 3000;
 
-/// Small splats in a ball of radius 1 around the origin.
+/// Returns small splats in a ball of radius 1 around the origin.
 fn cloud() -> Splats {
     let random = &mut Random::new(11);
     let mut splats = Splats::default();
@@ -28,7 +28,7 @@ fn cloud() -> Splats {
     splats
 }
 
-/// Near, middle, far: from full detail to the coarsest level.
+/// Returns near, middle and far cameras: from full detail to the coarsest level.
 fn cameras() -> Vec<Camera> {
     [2.0, 30.0, 200.0, 5000.0]
         .map(|distance_m| Camera {
@@ -50,7 +50,7 @@ fn render_all(splats: &Splats, detail: Detail) -> Vec<RgbdImage> {
     images
 }
 
-/// Renders with levels; every image is clean and as like that of full detail as is asked.
+/// Renders in adaptive detail. Checks that every image is clean and at least `least_db` similar to full detail.
 fn check(name: &str, splats: &Splats, least_db: f64) {
     let truth = render_all(splats, Detail::Full);
     for max_error_px in [0.35, 3.0] {
@@ -69,12 +69,12 @@ fn check(name: &str, splats: &Splats, least_db: f64) {
 }
 
 #[test]
-fn a_cloud_is_like_itself_at_every_distance() {
+fn cloud_is_similar_at_every_distance() {
     check("cloud", &cloud(), 38.0);
 }
 
 #[test]
-fn few_splats_are_no_trouble() {
+fn renders_scenes_with_few_splats() {
     for count in [0, 1, 2, 255, 256, 257, 1024, 1025] {
         let mut splats = cloud();
         splats.means_m.truncate(count);
@@ -93,7 +93,7 @@ fn extreme_scales_stay_clean() {
             let mut splats = cloud();
             splats.scales_m.fill(Vec3::new(scale_m, scale_m, flat));
             check(&format!("scales {scale_m} {flat}"), &splats, 30.0);
-            // A few among ordinary ones.
+            // Some among ordinary splats.
             let mut splats = cloud();
             for scale in splats.scales_m.iter_mut().step_by(100) {
                 *scale = Vec3::new(scale_m, flat, scale_m);
@@ -124,7 +124,7 @@ fn coincident_and_identical_splats_stay_clean() {
     check("identical", &splats, 30.0);
     splats.scales_m.fill(Vec3::ZERO);
     check("identical points", &splats, 30.0);
-    // Apart by no more than rounding.
+    // Distances within the rounding error.
     for (i, mean_m) in splats.means_m.iter_mut().enumerate() {
         mean_m.x = f32::from_bits(mean_m.x.to_bits() + (i % 3) as u32);
     }
@@ -132,7 +132,7 @@ fn coincident_and_identical_splats_stay_clean() {
 }
 
 #[test]
-fn places_far_away_stay_clean() {
+fn distant_positions_stay_clean() {
     for far_m in [1e6, 1e19, 1e30, f32::MAX] {
         let mut splats = cloud();
         for mean_m in splats.means_m.iter_mut().step_by(50) {

@@ -1,5 +1,5 @@
-//! A walk through a generated room: photos, their poses, and points as structure from motion finds
-//! them. What it knows beyond a capture, true depths, is kept apart, to judge by.
+//! A walk through a generated room: photos, their poses, and points as structure from motion finds them. True depths
+//! are kept separately, for the evaluation.
 
 use glam::{DQuat, DVec3, Vec3};
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World, body_from_forward_cam};
@@ -7,7 +7,7 @@ use vizflyt_scenes::walk::Walk;
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats};
 use vizflyt_twin::random::Random;
 
-/// What is captured.
+/// A synthetic capture.
 pub(crate) struct Capture {
     pub(crate) intrinsics: Intrinsics,
     pub(crate) photos: Vec<Photo>,
@@ -17,35 +17,35 @@ pub(crate) struct Capture {
 pub(crate) struct Photo {
     pub(crate) world_from_cam: Pose<World, Cam>,
     pub(crate) rgb: Vec<u8>,
-    /// Median camera-z depth, 0 where there is none. [m]
+    /// Median camera-z depth, 0 if there is no return. [m]
     pub(crate) true_depth_m: Vec<f32>,
 }
 
 pub(crate) struct Point {
     pub(crate) p_world_m: Vec3,
     pub(crate) rgb: [u8; 3],
-    /// Photos that saw it, and where. [px]
+    /// Photos that saw the point, with its pixel. [px]
     pub(crate) seen: Vec<(usize, [f32; 2])>,
 }
 
 const WIDTH: u32 = 320;
 const HEIGHT: u32 = 240;
-/// As a phone's wide camera.
+/// Focal length of a phone's wide camera.
 const FOCAL_PX: f64 = 200.0;
-/// Points that are looked for in each photo.
+/// Number of corners per photo.
 const CORNERS: usize = 150;
-/// What structure from motion leaves of a point's place. [m]
+/// Noise of a point's position after structure from motion. [m]
 const POINT_NOISE_M: f32 = 0.01;
 /// Noise of the photos. [8-bit steps]
 const PIXEL_NOISE: f32 = 2.0;
 
-/// Returns the poses of a walk as people film: over free floor, at eye level, looking to one side and the other.
+/// Returns the poses of a walk as people film: over free floor, at eye level, looking to both sides.
 pub(crate) fn walked(walk: &Walk, photos: usize) -> Vec<Pose<World, Cam>> {
     (0..photos).map(|i| walk.world_from_cam(walk.seconds() * i as f64 / photos as f64)).collect()
 }
 
-/// Returns the poses of a harder one around an 11 x 4.5 m room: a loop, the camera swaying far from side to side and up
-/// and down.
+/// Returns the poses of a more difficult walk around an 11 x 4.5 m room: a loop, with the camera swaying far sideways
+/// and up and down.
 pub(crate) fn looped(photos: usize) -> Vec<Pose<World, Cam>> {
     (0..photos).map(|i| pose(i as f64 / photos as f64)).collect()
 }
@@ -102,7 +102,7 @@ pub(crate) fn capture(splats: &Splats, poses: &[Pose<World, Cam>], seed: u64) ->
     Capture { intrinsics, photos, points }
 }
 
-/// Finds corners, the strongest of each neighbourhood, and follows them into the other photos.
+/// Detects the strongest corner of each neighbourhood, and projects it into the other photos.
 fn points(k: &Intrinsics, photos: &[Photo], random: &mut Random) -> Vec<Point> {
     let (width, height) = (k.width_px as usize, k.height_px as usize);
     let mut points = Vec::new();
@@ -122,7 +122,7 @@ fn points(k: &Intrinsics, photos: &[Photo], random: &mut Random) -> Vec<Point> {
                         let gy = grey(u, v + 1) - grey(u, v - 1);
                         (xx, xy, yy) = (xx + gx * gx, xy + gx * gy, yy + gy * gy);
                     }
-                    // The lesser eigenvalue (Shi and Tomasi 1994).
+                    // The smaller eigenvalue (Shi and Tomasi 1994).
                     0.5 * (xx + yy) - (0.25f32 * (xx - yy) * (xx - yy) + xy * xy).sqrt()
                 };
                 let places = (0..144).map(|n| (cell_x + n % 12, cell_y + n / 12));
@@ -154,7 +154,7 @@ fn points(k: &Intrinsics, photos: &[Photo], random: &mut Random) -> Vec<Point> {
                     continue;
                 }
                 let depth_m = other.true_depth_m[pixel.y as usize * width + pixel.x as usize];
-                // Feature matchers lose a point that is seen from much further away.
+                // Feature matchers lose points seen from other positions: limit the distance in the sequence.
                 if (f64::from(depth_m) - p_cam.z).abs() < 0.02 * p_cam.z && j.abs_diff(i) <= 6 {
                     seen.push((j, [pixel.x as f32, pixel.y as f32]));
                 }

@@ -1,4 +1,4 @@
-//! A capture as the folder that COLMAP leaves, in text.
+//! Writes a capture as a COLMAP folder in text form.
 
 use std::fmt::Write;
 use std::io;

@@ -1,4 +1,4 @@
-//! A rebuilt room against the true one: depths as cameras see them, obstacles as the referee bakes them.
+//! Compares a rebuilt room with the true one: depths seen by the cameras, and obstacles baked for the referee.
 
 use glam::{DQuat, DVec3};
 use vizflyt_arena::{ArenaConfig, BakeSpec, Ellipsoid, OccupancyGrid};
@@ -10,40 +10,40 @@ use vizflyt_twin::carve::{CarveOptions, Carved, Seen, Voxels};
 use crate::capture::{Capture, depth_m, render};
 use crate::profile::Profile;
 
-/// What is off.
+/// Errors of a rebuilt room.
 #[derive(Debug)]
 pub(crate) struct Verdict {
     /// Median relative error of the median depth, over pixels of the photos.
     pub(crate) depth_median: f64,
-    /// Share of pixels within 10 %; no return is off.
+    /// Fraction of pixels with a depth error within 10 %; no return counts as an error.
     pub(crate) within_tenth: f64,
-    /// Occupied voxels over those baked from the true splats.
+    /// Number of occupied voxels, relative to those baked from the true splats.
     pub(crate) occupied: f64,
-    /// Occupied voxels within the fence, where vehicles fly, and those baked from the true splats.
+    /// Occupied voxels inside the fence, where vehicles fly, and the number of true ones.
     pub(crate) within_fence: usize,
     pub(crate) truly_within_fence: usize,
-    /// As `occupied`, of those beside what was seen to be free, which a vehicle can meet; NaN before carving.
+    /// Like `occupied`, for voxels next to seen free space, which a vehicle can meet; NaN before carving.
     pub(crate) beside_seen: f64,
-    /// Occupied voxels in which the camera itself has been.
+    /// Occupied voxels in which the camera has been.
     pub(crate) on_way: usize,
-    /// Of the photos' truth, without exposure.
+    /// PSNR of the photos, without exposure correction.
     pub(crate) psnr_db: f64,
-    /// Where the occupied voxels are.
+    /// Classification of the occupied voxels.
     pub(crate) profile: Profile,
 }
 
-/// Carves a rebuilt room by its capture, within the arena's own voxels.
+/// Carves a rebuilt room by its capture, in the arena's voxels.
 pub(crate) fn carve(dataset: &Dataset, splats: &Splats, arena: &ArenaConfig) -> Carved {
     let grid = BakeSpec::of(arena).grid;
     let voxels = Voxels { min_m: grid.min_m, side_m: grid.voxel_m, size: grid.size };
     vizflyt_twin::carve::carve(dataset, splats, &IN_WORLD, voxels, &CarveOptions::default())
 }
 
-/// The room's poses are the world's.
+/// The room's poses are in the world frame.
 const IN_WORLD: Similarity =
     Similarity { scale: 1.0, rotation: DQuat::IDENTITY, translation_m: DVec3::ZERO };
 
-/// Judges; `only` says by which photos.
+/// Evaluates the rebuilt room; `only` selects the photos.
 pub(crate) fn judge(
     splats: &Splats,
     truth: &Splats,

@@ -1,12 +1,12 @@
-//! Captures a generated room, rebuilds it from the photos, and says how far the twin is from the truth.
+//! Captures a generated room, rebuilds it from the photos, and prints the errors of the twin.
 //!
 //! ```text
 //! cargo run --release -p vizflyt-twin --example hall
 //! cargo run --release -p vizflyt-twin --example hall -- steps=1000 splats=40000 folder=hall sheet=hall.png
 //! ```
-//! `race=SEED` takes a race hall on a usual walk of `seconds` instead of the room. `save` writes what was trained, `scene` judges
-//! and carves that instead of training. `folder` keeps the capture as COLMAP would leave it; `sheet` shows held-out photos: truth,
-//! twin, and the depths of both. Other keys are those of [`Options`].
+//! `race=SEED` takes a race hall on a normal walk of `seconds` instead of the room. `save` writes the trained scene;
+//! `scene` evaluates and carves a given scene instead of training. `folder` keeps the capture as a COLMAP folder.
+//! `sheet` shows held-out photos: truth, twin, and the depths of both. Other keys are those of [`Options`].
 
 mod capture;
 mod folder;
@@ -49,7 +49,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             "seconds" => seconds = value.parse()?,
             "folder" => kept = Some(PathBuf::from(value)),
             "sheet" => sheet = Some(PathBuf::from(value)),
-            _ => return Err(format!("no option is called '{key}'").into()),
+            _ => return Err(format!("unknown option '{key}'").into()),
         }
     }
     let (scene, poses) = match race {
@@ -86,8 +86,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let carved = judge::carve(&dataset, &splats, &scene.arena);
     let CarveCounts { looked_through, on_path, seen, voxels, seconds, .. } = carved.counts;
     println!(
-        "carved       {looked_through} splats looked through, {on_path} on the way; {:.0} % of the voxels seen, in \
-         {seconds:.1} s",
+        "carved       {looked_through} splats looked through, {on_path} on the camera's path; {:.0} % of the \
+         voxels seen, in {seconds:.1} s",
         100.0 * seen as f64 / voxels as f64
     );
     let splats = carved.splats;
@@ -98,7 +98,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Trains, and says how it goes.
+/// Trains, and prints the progress.
 fn train(dataset: &Dataset, options: Options) -> Result<Splats, Box<dyn Error>> {
     let start_s = cpu_s();
     let mut trainer = Trainer::new(dataset, options);
@@ -133,8 +133,8 @@ fn print(verdict: &judge::Verdict) {
         verdict.psnr_db
     );
     println!(
-        "obstacles    {:.2} times the true voxels, {:.2} of those beside what was seen; within the fence {} where {} are \
-         true; {} on the way",
+        "obstacles    {:.2} times the true voxels, {:.2} of those next to seen space; within the fence {} where {} are \
+         true; {} on the camera's path",
         verdict.occupied,
         verdict.beside_seen,
         verdict.within_fence,
@@ -144,7 +144,7 @@ fn print(verdict: &judge::Verdict) {
     println!("voxels       {}", verdict.profile);
 }
 
-/// Writes truth and twin next to each other, colour and depth, of some held-out photos.
+/// Writes truth and twin side by side, colour and depth, for some held-out photos.
 fn draw(
     splats: &Splats,
     capture: &capture::Capture,
@@ -174,12 +174,12 @@ fn draw(
     Ok(())
 }
 
-/// Returns the processor time of this process, 0 where the system does not say. [s]
+/// Returns the processor time of this process; 0 if unavailable. [s]
 fn cpu_s() -> f64 {
     /// Linux's `USER_HZ`.
     const TICKS_PER_S: f64 = 100.0;
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    // Fields 14 and 15; the name before them may hold spaces.
+    // Fields 14 and 15; the name before them may contain spaces.
     let fields: Vec<&str> = stat.rsplit(") ").next().unwrap_or("").split(' ').collect();
     let ticks = |i: usize| fields.get(i).and_then(|v| v.parse::<f64>().ok()).unwrap_or(0.0);
     (ticks(11) + ticks(12)) / TICKS_PER_S

@@ -1,5 +1,4 @@
-//! Where a twin's occupied voxels are, class by class: which of them are right, which are surplus, and what the
-//! capture could have known about these.
+//! Classifies a twin's occupied voxels: correct ones, surplus ones, and what the capture shows about the surplus ones.
 
 use std::fmt;
 
@@ -9,23 +8,23 @@ use vizflyt_arena::grid::Grid;
 
 use crate::capture::Capture;
 
-/// Voxels by class, in shares of the truly occupied ones.
+/// Voxels by class, as fractions of the truly occupied ones.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Profile {
-    /// Truly occupied, and occupied in the twin as well.
+    /// Truly occupied, and occupied in the twin.
     pub(crate) found: f64,
-    /// Truly occupied, and seen by a photo or beside what is, but free in the twin and around it.
+    /// Truly occupied and visible to a photo, but free in the twin including its neighbours.
     pub(crate) missed: f64,
-    /// Surplus ones beside a true one, and two voxels from it: surfaces that are thick or displaced.
+    /// Surplus next to a true voxel, and two voxels away: thick or displaced surfaces.
     pub(crate) beside: f64,
     pub(crate) near: f64,
-    /// Further: where two photos and more truly look through, where one does, behind the true surface in all photos,
-    /// and where no photo looks.
+    /// Surplus farther away: where two or more photos truly look through, where one does, behind the true surface in
+    /// all photos, and outside all photos.
     pub(crate) open: f64,
     pub(crate) once: f64,
     pub(crate) behind: f64,
     pub(crate) outside: f64,
-    /// Of these further ones, those above the fence.
+    /// Surplus farther away and above the fence.
     pub(crate) above: f64,
 }
 
@@ -93,14 +92,14 @@ impl fmt::Display for Profile {
         let Self { found, missed, beside, near, open, once, behind, outside, above } = self;
         write!(
             out,
-            "{found:.3} found, {missed:.3} missed; surplus {beside:.3} beside true ones, {near:.3} two voxels off; further \
-             {open:.3} seen through, {once:.3} by one photo, {behind:.3} behind surfaces, {outside:.3} in no photo; {above:.3} \
+            "{found:.3} found, {missed:.3} missed; surplus {beside:.3} next to true ones, {near:.3} two voxels \
+             off; further {open:.3} seen through, {once:.3} by one photo, {behind:.3} behind surfaces, {outside:.3} in no photo; {above:.3} \
              of these above the fence"
         )
     }
 }
 
-/// Returns how many photos truly look beyond a place, a voxel at least, and whether any has it within its borders.
+/// Returns the number of photos that truly look past a position by at least a voxel, and whether any photo contains it.
 fn looks(capture: &Capture, p_m: DVec3, voxel_m: f64) -> (usize, bool) {
     let (mut through, mut shown) = (0, false);
     let k = &capture.intrinsics;

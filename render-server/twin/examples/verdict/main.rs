@@ -1,12 +1,12 @@
-//! Adjusts and judges a capture of a generated scene, and says how far it is from the truth.
+//! Adjusts and judges a capture of a generated scene, and prints its error from the truth.
 //!
 //! ```console
 //! $ vizflyt scene generate room --seed 3 --tags --capture room3/ --frames 80
 //! $ colmap feature_extractor ... && colmap exhaustive_matcher ... && colmap mapper ... --output_path room3/sparse
 //! $ cargo run --release -p vizflyt-twin --example verdict -- room3/ room3/sparse/0 room3/sparse/1
 //! ```
-//! The first model is judged, the others are second opinions. `--tags none|sizes|layout` (the default) says what is
-//! known of the tags; `--record FOLDER` writes the capture, thinned, as tests read it.
+//! The first model is judged; further models are second opinions. `--tags none|sizes|layout` selects what is known of
+//! the tags (default: `layout`). `--record FOLDER` writes the thinned capture in the format of the tests.
 
 mod record;
 mod truth;
@@ -29,7 +29,7 @@ use truth::Truth;
 
 type Failure = Box<dyn std::error::Error>;
 
-/// Corners of each tag in each image, by its name and the tag's index.
+/// Tags in each image (by name): tag index and corners.
 type Sightings = BTreeMap<String, Vec<(usize, [[f64; 2]; 4])>>;
 
 fn main() -> Result<ExitCode, Failure> {
@@ -122,7 +122,7 @@ fn report(truth: &Truth, capture: &Capture, adjusted: &adjust::Adjusted) {
             (*name, vizflyt_protocol::geometry::Pose::new(at, to.rotation * pose.rotation))
         })
         .collect();
-    println!("  model, placed by tags alone:   {}", truth.compare(&tagged, false));
+    println!("  model, placed by tags only:    {}", truth.compare(&tagged, false));
     let after: Vec<_> = capture
         .images
         .iter()
@@ -166,7 +166,7 @@ fn add_tags(capture: &mut Capture, layout: &TagLayout, sightings: &Sightings, is
     }
 }
 
-/// Finds tags in all images; what was found is kept beside them.
+/// Detects tags in all images, and caches the result in the folder.
 fn sightings(
     folder: &Path,
     layout: &TagLayout,

@@ -1,5 +1,5 @@
-//! A capture made small enough to stand in a repository: COLMAP's text with the points that most images saw, and what
-//! else a verdict needs.
+//! Thins a capture for the repository: COLMAP's text with the points that most images saw, and the other input of a
+//! verdict.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -89,10 +89,10 @@ pub(crate) fn record(
     Ok(())
 }
 
-/// Corners are known to less than this. [px]
+/// Rounds to 0.01 px; corners are less accurate than this.
 fn tenth(x: f64) -> f64 {
     (x * 100.0).round() / 100.0
 }
 
-/// Enough for a pose, and for parts to hang together.
+/// Number of points per image: enough for a pose and for connected parts.
 const PER_IMAGE: usize = 40;

@@ -1,4 +1,4 @@
-//! Where the camera truly was, and how far a model is from that.
+//! True poses of the camera, and the error of a model.
 
 use std::path::Path;
 
@@ -7,9 +7,9 @@ use serde::Deserialize;
 use vizflyt_protocol::geometry::{Cam, Pose, World};
 use vizflyt_twin::align::points::{self, Pair};
 
-/// Beside a capture.
+/// True poses of a capture's images.
 pub(crate) struct Truth {
-    /// In the order of time.
+    /// Images in the order of time.
     pub(crate) images: Vec<TrueImage>,
 }
 
@@ -20,7 +20,7 @@ pub(crate) struct TrueImage {
 }
 
 impl TrueImage {
-    /// Returns where it was taken from, to a millimetre. [m, world]
+    /// Returns the true position, rounded to a millimetre. [m, world]
     pub(crate) fn position_m(&self) -> [f64; 3] {
         self.pose.translation_m.to_array().map(|x| (x * 1e3).round() / 1e3)
     }
@@ -58,7 +58,7 @@ impl Truth {
         Ok(Self { images: images.collect() })
     }
 
-    /// Returns centres' and rotations' distances in words; `is_fitted` takes out the similarity that fits best first.
+    /// Formats the errors of the camera's positions; `is_fitted` removes the best-fitting similarity transform first.
     pub(crate) fn compare(&self, poses: &[(&str, Pose<World, Cam>)], is_fitted: bool) -> String {
         let pairs: Vec<(Pose<World, Cam>, Pose<World, Cam>)> = poses
             .iter()
@@ -71,7 +71,7 @@ impl Truth {
             .iter()
             .map(|(found, truth)| Pair { scene: found.translation_m, world_m: truth.translation_m })
             .collect();
-        // A great sigma: all count, as in the usual measure of trajectories.
+        // A large sigma: all images count, as in the usual error measure of trajectories.
         let Ok(fit) = points::fit(&places, 1e3) else { return "no similarity fits".to_owned() };
         let to = fit.world_from_scene;
         let mut off_m: Vec<f64> = pairs

@@ -1,4 +1,4 @@
-//! What a bundle adjustment starts from: images that structure from motion has placed, and what is known of the room.
+//! Input of a bundle adjustment: images placed by structure from motion, and other measurements of the room.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -7,112 +7,112 @@ use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 
 use crate::dataset::SparseModel;
 
-/// Images, points and tags. Places are in the frame of structure from motion, of any size and turn: `scene`.
+/// Images, points and tags. Positions are in the frame of structure from motion (`scene`), with arbitrary scale and
+/// rotation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Capture {
-    /// The lens of all images.
+    /// Common lens of all images.
     pub lens: Intrinsics,
-    /// Placed images, in the order of time.
+    /// Images with poses, in the order of time.
     pub images: Vec<Image>,
-    /// What they saw. [scene]
+    /// Points seen in the images. [scene]
     pub points: Vec<DVec3>,
-    /// Printed tags that stood in the room.
+    /// Printed tags in the room.
     pub tags: Vec<Tag>,
-    /// Where the point that [`Place`] tells of sits beside the lens. [m, cam]
+    /// Position of the point that [`Place`] measures, relative to the lens. [m, cam]
     pub tracked_in_cam_m: DVec3,
 }
 
-/// An image that was placed.
+/// An image with a pose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image {
-    /// Its file's name.
+    /// File name.
     pub name: String,
-    /// When it was taken, from the start of the video. [s]
+    /// Time from the start of the video. [s]
     pub at_s: f64,
-    /// Where from. [scene]
+    /// Camera pose. [scene]
     pub scene_from_cam: Pose<World, Cam>,
-    /// Points that were found in it.
+    /// Points detected in the image.
     pub seen: Vec<Sighting>,
-    /// Tags that were found in it.
+    /// Tags detected in the image.
     pub tags: Vec<TagSighting>,
-    /// Where the tracked point was, if something else followed it.
+    /// Measured position of the tracked point, if available.
     pub place: Option<Place>,
-    /// Which way is up, if something else knows it.
+    /// Measured vertical, if available.
     pub up: Option<Up>,
 }
 
-/// A point that was found in an image.
+/// Observation of a point in an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sighting {
-    /// Which of [`Capture::points`].
+    /// Index in [`Capture::points`].
     pub point: usize,
-    /// Where. [px]
+    /// Position in the image. [px]
     pub pixel: DVec2,
 }
 
-/// A tag that was found in an image.
+/// Observation of a tag in an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TagSighting {
-    /// Which of [`Capture::tags`].
+    /// Index in [`Capture::tags`].
     pub tag: usize,
-    /// Lower left, lower right, upper right, upper left. [px]
+    /// Corners: lower left, lower right, upper right, upper left. [px]
     pub corners_px: [DVec2; 4],
 }
 
 /// A printed tag.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tag {
-    /// For people, as "tag36h11 7".
+    /// Display name, for example "tag36h11 7".
     pub name: String,
     /// Edge of the outer black square. [m]
     pub size_m: f64,
-    /// Where its corners are, in the order of sightings, if that was measured. [m, world]
+    /// Measured corners, in the order of sightings, if available. [m, world]
     pub corners_m: Option<[DVec3; 4]>,
 }
 
-/// A measured place.
+/// A measured position.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Place {
-    /// Where. [m, world]
     pub position_m: DVec3,
-    /// How well that is known along each axis, one sigma. [m]
+    /// Standard deviation along each axis. [m]
     pub sigma_m: f64,
 }
 
 /// A measured vertical.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Up {
-    /// Of unit length. [cam]
+    /// Upward direction, of unit length. [cam]
     pub direction: DVec3,
-    /// One sigma. [rad]
+    /// Standard deviation. [rad]
     pub sigma_rad: f64,
 }
 
-/// Why a model is no capture.
+/// Why a model cannot be used as a capture.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum CaptureError {
-    /// Each image, or some, with a lens of its own.
+    /// Images have different lenses.
     #[error(
-        "{first} and {other} have lenses of their own; film with one camera at one zoom, and let structure from \
+        "{first} and {other} have different lenses; film with one camera at one zoom, and let structure from \
          motion share one lens among all images"
     )]
     ManyLenses {
-        /// An image.
+        /// Name of an image.
         first: String,
-        /// One that differs.
+        /// Name of an image with another lens.
         other: String,
     },
-    /// Nothing was placed.
+    /// The model has no images.
     #[error("no image was placed; film slowly, with much in view that has texture")]
     Empty,
 }
 
 impl Capture {
-    /// Makes a capture of a model; `at_s` tells when an image was taken, by its name, and may put them into another
-    /// order. No tags, no places.
+    /// Creates a capture from a model, without tags and measured positions. `at_s` returns the time of an image by its
+    /// name; images are sorted by it.
     ///
     /// # Errors
-    /// More than one lens, or no image.
+    /// Different lenses, or no images.
     pub fn new(model: &SparseModel, at_s: impl Fn(&str) -> f64) -> Result<Self, CaptureError> {
         let first = model.images.first().ok_or(CaptureError::Empty)?;
         let alike = |image: &&crate::dataset::SparseImage| image.intrinsics != first.intrinsics;
@@ -120,7 +120,7 @@ impl Capture {
             let (first, other) = (first.name.clone(), other.name.clone());
             return Err(CaptureError::ManyLenses { first, other });
         }
-        // In the order of their ids: a map has none that is the same twice.
+        // Sorted by id, because the order of a hash map is not reproducible.
         let points: BTreeMap<u64, DVec3> =
             model.points.iter().map(|(&id, point)| (id, point.position)).collect();
         let number: HashMap<u64, usize> =
@@ -160,6 +160,6 @@ impl Capture {
     }
 }
 
-/// Corners of a tag of edge 1: x to the right and y up as its reader sees it.
+/// Corners of a tag with edge length 1: x right and y up for its reader.
 const SQUARE: [DVec2; 4] =
     [DVec2::new(-0.5, -0.5), DVec2::new(0.5, -0.5), DVec2::new(0.5, 0.5), DVec2::new(-0.5, 0.5)];

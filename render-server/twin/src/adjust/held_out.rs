@@ -1,4 +1,4 @@
-//! Tags that had no say: where the images see them once they no longer pull.
+//! Cross-validation by tags: triangulates tags that the adjustment did not use.
 
 use glam::{DMat3, DVec3};
 
@@ -8,8 +8,8 @@ use super::state::{State, TagPlace, inwards};
 use super::{HeldOut, Known, Options};
 use crate::align::corners::{Ray, meet};
 
-/// Returns what each tag says that was held out, in the order of the capture's; `None` where too few others are left to
-/// place it, or too few images saw it.
+/// Returns the result of each held-out tag, in the order of the capture's tags. `None` if too few other tags remain to
+/// align the capture, or if too few images saw the tag.
 pub(super) fn held_out(
     capture: &Capture,
     state: &State,
@@ -21,7 +21,7 @@ pub(super) fn held_out(
     let is_placed = |tag: &usize| !matches!(state.tags[*tag], TagPlace::Nowhere);
     let is_given = |tag: &usize| matches!(state.tags[*tag], TagPlace::Given(_));
     let placed: Vec<usize> = (0..capture.tags.len()).filter(is_placed).collect();
-    // Measured places and sizes alone are held to different things; what has both goes by its place.
+    // Measured positions and sizes are compared with different quantities; a tag with both counts by its position.
     let any_given = placed.iter().any(is_given);
     let anchors: Vec<usize> = placed.into_iter().filter(|tag| is_given(tag) == any_given).collect();
     if anchors.len() < 2 {
@@ -41,7 +41,7 @@ pub(super) fn held_out(
     results
 }
 
-/// Returns where images alone have a tag.
+/// Triangulates a tag from images only.
 fn look(capture: &Capture, state: &State, tag: usize) -> Option<HeldOut> {
     let mut rays: [Vec<Ray>; 4] = Default::default();
     for (camera, image) in capture.images.iter().enumerate() {
@@ -88,5 +88,5 @@ fn look(capture: &Capture, state: &State, tag: usize) -> Option<HeldOut> {
     })
 }
 
-/// Each takes some rounds of the whole adjustment.
+/// Number of groups; each needs some rounds of the complete adjustment.
 const PARTS: usize = 5;

@@ -1,4 +1,4 @@
-//! What came out, and how well it is known.
+//! Result of an adjustment, and its accuracy.
 
 use glam::{DMat3, DVec3};
 
@@ -8,7 +8,7 @@ use super::start::Start;
 use super::state::State;
 use super::{Adjusted, HeldOut, Known, Readout, TagResult};
 
-/// Puts the result together.
+/// Assembles the result.
 pub(super) fn describe(
     capture: &Capture,
     state: &State,
@@ -35,7 +35,7 @@ pub(super) fn describe(
             .collect(),
         inset_px: state.inset_px,
         scale_sigma: known.scale.then(|| scale_sigma.hypot(by_tags)),
-        // What moves tags by a share of the distance between them turns by that angle.
+        // Tags displaced by a fraction of the distance between them rotate the result by that angle.
         tilt_sigma_rad: known.up.then(|| {
             let turned = if known.place { by_tags } else { 0.0 };
             tilt_sigma_rad.hypot(turned)
@@ -44,14 +44,14 @@ pub(super) fn describe(
     }
 }
 
-/// Returns one sigma of the scale and of the vertical [rad], the worse direction: of the similarity that moves all
-/// cameras most nearly as their errors do, by the covariance of the normal equations.
+/// Returns the standard deviations of the scale and of the vertical [rad] (in the worse direction). They belong to the
+/// similarity transform closest to the cameras' errors, by the covariance of the normal equations.
 fn sigmas(state: &State, solved: &Solved) -> (f64, f64) {
     let middle = middle_m(state);
     let count = state.cameras.len() as f64;
     let arms = || state.cameras.iter().map(|pose| pose.translation_m - middle);
     let reach2: f64 = arms().map(DVec3::length_squared).sum();
-    // A camera's own turn counts as a point at the mean distance.
+    // A camera's own rotation counts like a point at the mean distance.
     let lever2 = reach2 / count;
     let mut inertia = DMat3::from_diagonal(DVec3::splat(count * lever2));
     for arm in arms() {
@@ -82,7 +82,7 @@ fn sigmas(state: &State, solved: &Solved) -> (f64, f64) {
     (scale_variance.max(0.0).sqrt(), worse.max(0.0).sqrt())
 }
 
-/// Returns the rows' readout and its sigma, if it was asked.
+/// Returns the readout time and its standard deviation, if estimated.
 fn readout(state: &State, solved: &Solved) -> Option<Readout> {
     let at = solved.layout.readout()?;
     let mut one = vec![0.0; solved.layout.size];
@@ -91,8 +91,8 @@ fn readout(state: &State, solved: &Solved) -> Option<Readout> {
     Some(Readout { seconds: state.rolling.readout_s, sigma_s })
 }
 
-/// Returns by what share of the distance between them tags that were held out are off, for as many as there are: the
-/// normal equations believe that a layout is exact.
+/// Returns the error of held-out tags relative to the distance between them, reduced by their number. The normal
+/// equations assume an exact layout and do not include it.
 fn tags_disagree(capture: &Capture, held_out: &[Option<HeldOut>]) -> f64 {
     let placed: Vec<(DVec3, f64)> = capture
         .tags
@@ -100,7 +100,7 @@ fn tags_disagree(capture: &Capture, held_out: &[Option<HeldOut>]) -> f64 {
         .zip(held_out)
         .filter_map(|(tag, held)| {
             let corners = tag.corners_m?;
-            // One that its own sightings place badly says nothing of the others.
+            // A tag that its own sightings place badly is no evidence about the others.
             let held = (*held).filter(|held| held.by_pixel_m <= MOST_BY_PIXEL_M)?;
             Some((corners.iter().sum::<DVec3>() / 4.0, held.off_m?))
         })
@@ -157,7 +157,7 @@ fn fit_of_tag(
     for (camera, image) in capture.images.iter().enumerate() {
         for seen in image.tags.iter().filter(|seen| seen.tag == tag) {
             sightings += 1;
-            // Near by, a blurred corner is many pixels off and still in its place.
+            // At short distance, a blurred corner can be many pixels off without contradicting.
             let ahead_m = state.cameras[camera].rotation.conjugate()
                 * (corners_m[0] - state.cameras[camera].translation_m);
             let near_px = CONTRADICTS_M * state.lens.fx_px / ahead_m.z.max(1e-3);
@@ -173,14 +173,15 @@ fn fit_of_tag(
     Some(TagResult { sightings, contradicting, corners_m, rms_px, held_out })
 }
 
-/// By a pixel in each image. [m]
+/// Maximum position error per pixel of image error, for a held-out tag that counts. [m]
 const MOST_BY_PIXEL_M: f64 = 0.03;
-/// Tags near each other are off together, where the walk between them drifted: so many count as fewer, by half. Without
-/// it, scales of recorded captures were off by 0.5 to 3 sigmas.
+/// Factor for correlated errors: nearby tags have a common error where the walk between them drifted. Without it,
+/// scales of recorded captures were off by 0.5 to 3 sigmas.
 const TOGETHER: f64 = 1.5;
-/// Beyond so many sigmas, two axes together, a sighting is none: of good ones one in 90.
+/// Outlier limit in sigmas, two axes together: it rejects one in 90 good sightings.
 const OUTLIER_SIGMAS: f64 = 3.0;
-/// A rolling shutter and blur move corners by less than this; what is somewhere else is farther off. [px]
+/// Minimum error of a contradicting sighting: rolling shutter and blur displace corners by less. [px]
 const CONTRADICTS_PX: f64 = 4.0;
-/// Of good captures, places are off by less; those that are mistaken for others, by far more. [m]
+/// Minimum error of a contradicting sighting as a length: in good captures, errors are smaller; confused tags are much
+/// farther off. [m]
 const CONTRADICTS_M: f64 = 0.05;

@@ -1,16 +1,16 @@
-//! Symmetric positive definite systems, dense, and small orthonormal bases.
+//! Dense symmetric positive definite systems, and small orthonormal bases.
 
 use glam::{DMat3, DVec2};
 use rayon::prelude::*;
 
-/// A symmetric matrix; its lower triangle, row by row.
+/// A symmetric matrix: its lower triangle, row by row.
 #[derive(Clone, Debug)]
 pub(super) struct Symmetric {
     size: usize,
     lower: Vec<f64>,
 }
 
-/// The lower triangular matrix whose product with its transpose was given (A.-L. Cholesky).
+/// Cholesky factor: the lower triangular matrix whose product with its transpose is the given matrix.
 #[derive(Clone, Debug)]
 pub(super) struct Factor(Symmetric);
 
@@ -19,7 +19,6 @@ impl Symmetric {
         Self { size, lower: vec![0.0; size * (size + 1) / 2] }
     }
 
-    /// Returns an element of the diagonal.
     pub(super) fn diagonal(&self, i: usize) -> f64 {
         self.lower[i * (i + 1) / 2 + i]
     }
@@ -30,7 +29,7 @@ impl Symmetric {
         self.lower[row * (row + 1) / 2 + column] += value;
     }
 
-    /// Adds a block whose first element is at (`row`, `column`), of which the part in the lower triangle counts.
+    /// Adds a block whose first element is at (`row`, `column`). Only its part in the lower triangle is used.
     pub(super) fn add_block<const R: usize, const C: usize>(
         &mut self,
         row: usize,
@@ -46,7 +45,7 @@ impl Symmetric {
         }
     }
 
-    /// Returns the sum of matrices of one size, each element's in their order; zero of none.
+    /// Returns the sum of matrices of equal size, in a fixed order; zero for an empty list.
     pub(super) fn sum(size: usize, all: &[&Self]) -> Self {
         let mut sum = Self::zero(size);
         sum.lower.par_chunks_mut(PIECE).enumerate().for_each(|(piece, sum)| {
@@ -57,14 +56,14 @@ impl Symmetric {
         sum
     }
 
-    /// Makes the diagonal larger by this share (Marquardt 1963).
+    /// Increases the diagonal by a fraction (Marquardt 1963).
     pub(super) fn damp(&mut self, share: f64) {
         for i in 0..self.size {
             self.lower[i * (i + 1) / 2 + i] *= 1.0 + share;
         }
     }
 
-    /// Returns its factor; `None` if it is not positive definite. The same to the last bit on any number of threads.
+    /// Returns the factor; `None` if the matrix is not positive definite. Bit-identical for any number of threads.
     pub(super) fn factor(mut self) -> Option<Factor> {
         for begin in (0..self.size).step_by(PANEL) {
             let end = (begin + PANEL).min(self.size);
@@ -74,13 +73,13 @@ impl Symmetric {
                 let greatest = row[i];
                 factor_row(&mut row[..i], begin, above);
                 let value = row[i] - dot(&row[..i], &row[..i]);
-                // What is left of the diagonal after subtraction must be more than rounding.
+                // The remainder of the diagonal must be larger than rounding errors.
                 if !(value > 1e-13 * greatest && value > 0.0) {
                     return None;
                 }
                 row[i] = value.sqrt();
             }
-            // These columns of the rows below, each for itself.
+            // The same columns of the rows below, each independently.
             let mut rows = Vec::with_capacity(self.size - end);
             let mut rest = after;
             for i in end..self.size {
@@ -95,7 +94,8 @@ impl Symmetric {
     }
 }
 
-/// Finds a row of the factor from a column on, given the rows above, which reach as far, and its elements before.
+/// Computes a row of the factor from a column on, given its preceding elements and the rows above up to the same
+/// length.
 fn factor_row(row: &mut [f64], from: usize, above: &[f64]) {
     for j in from..row.len() {
         let other = &above[j * (j + 1) / 2..][..=j];
@@ -104,7 +104,7 @@ fn factor_row(row: &mut [f64], from: usize, above: &[f64]) {
 }
 
 impl Factor {
-    /// Solves for one right side.
+    /// Solves for one right-hand side.
     pub(super) fn solve(&self, mut x: Vec<f64>) -> Vec<f64> {
         let Symmetric { size, lower } = &self.0;
         for i in 0..*size {
@@ -122,12 +122,12 @@ impl Factor {
     }
 }
 
-/// Columns that are found together: with as many rows they stay in a core's cache.
+/// Number of columns per panel: with as many rows, they fit into a core's cache.
 const PANEL: usize = 32;
-/// Elements that are added by one thread.
+/// Number of elements that one thread adds.
 const PIECE: usize = 1 << 15;
 
-/// Eight sums at once: one waits for itself.
+/// Dot product with eight partial sums: a single sum would wait for itself.
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut sums = [0.0; 8];
     let (a_eights, a_rest) = a.as_chunks::<8>();
@@ -141,8 +141,8 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     sums.iter().sum::<f64>() + rest
 }
 
-/// Makes three columns orthonormal, each less what those before it are (Gram and Schmidt, twice); returns the upper
-/// triangle that makes the former columns of the new ones. `None` if they depend on each other, but for rounding.
+/// Orthonormalises three columns (Gram-Schmidt, twice). Returns the upper triangular matrix that computes the original
+/// columns from the new ones; `None` if the columns are numerically dependent.
 pub(super) fn orthonormal(columns: &mut [Vec<DVec2>; 3]) -> Option<DMat3> {
     let product = |a: &[DVec2], b: &[DVec2]| a.iter().zip(b).map(|(a, b)| a.dot(*b)).sum::<f64>();
     let mut upper = DMat3::ZERO;
@@ -151,7 +151,7 @@ pub(super) fn orthonormal(columns: &mut [Vec<DVec2>; 3]) -> Option<DMat3> {
         let (before, column) = columns.split_at_mut(k);
         let column = &mut column[0];
         let length2 = product(column, column);
-        // What rounding left of the others after the first time is taken away the second time.
+        // The second pass removes what rounding left of the other columns in the first.
         for _ in 0..2 {
             for (j, other) in before.iter().enumerate() {
                 let along = product(other, column);
@@ -177,7 +177,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn solutions_solve(
+        fn solutions_satisfy_the_system(
             rows in prop::collection::vec(prop::collection::vec(-1.0..1.0f64, 70), 73),
             right in prop::collection::vec(-1.0..1.0f64, 70),
         ) {
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn blocks_keep_to_the_lower_triangle_and_flat_systems_are_refused() {
+    fn blocks_fill_only_the_lower_triangle_and_singular_systems_fail() {
         let mut matrix = Symmetric::zero(3);
         matrix.add_block(1, 1, &[[1.0, 9.0], [1.0, 1.0]]);
         matrix.add_block(0, 0, &[[2.0]]);
@@ -209,8 +209,8 @@ mod tests {
     }
 
     #[test]
-    fn columns_become_orthonormal_unless_they_depend_on_each_other() {
-        // Nearly one, as those of a point just before a camera.
+    fn orthonormalises_columns_unless_they_are_dependent() {
+        // Nearly parallel, like those of a point very close to a camera.
         let columns =
             [1e-4, 2e-4, 3e-4].map(|off| vec![DVec2::new(1.0, off), DVec2::new(off * off, 1.0)]);
         let mut basis = columns.clone();

@@ -1,11 +1,11 @@
-//! Structure from motion's poses -> metric poses: bundle adjustment over points, tags and what else is known of the room.
+//! Bundle adjustment over points, tags and other measurements: poses of structure from motion become metric poses.
 //!
 //! ```text
 //! Capture --start--> a similarity to metres --solve--> poses, lens, points, tags in metres
 //!                                              '------> sigma of scale and tilt; residuals of tags that were held out
 //! ```
-//! Tags cannot mend wrong poses from outside, by a similarity alone: here their corners pull at poses and lens together
-//! with the points. What comes out says how well it is known, for [`crate::verdict`] to judge.
+//! A similarity transform from tags cannot correct wrong poses. Here, the tags' corners constrain poses and lens
+//! together with the points. The result includes its accuracy, which [`crate::verdict`] judges.
 
 mod capture;
 mod held_out;
@@ -31,14 +31,14 @@ use crate::align::{AlignError, Similarity};
 
 pub use capture::{Capture, CaptureError, Image, Place, Sighting, Tag, TagSighting, Up};
 
-/// How to adjust.
+/// Options of an adjustment.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
-    /// Whether focal length, k1, k2 and principal point are found too: not for a lens that was calibrated.
+    /// Estimate focal length, k1, k2 and principal point; not for calibrated lenses.
     pub refine_lens: bool,
-    /// Whether tags are held out, which takes about as long again for each of a few parts.
+    /// Hold out tags for validation. Each of a few groups takes about as long as the adjustment itself.
     pub hold_out: bool,
-    /// Whether rows may have been exposed one after the other: by images whose times are true.
+    /// Estimate the readout time of a rolling shutter; needs true image times.
     pub rolling: bool,
 }
 
@@ -48,110 +48,111 @@ impl Default for Options {
     }
 }
 
-/// A capture in metres.
+/// An adjusted capture in metres.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Adjusted {
-    /// What is metric about it.
+    /// Metric quantities determined by measurements.
     pub known: Known,
-    /// Takes `scene` about to where the images now are: what was there before the adjustment bent it.
+    /// Approximate transform from `scene` to the adjusted frame: the one before the adjustment, without its
+    /// deformation.
     pub world_from_scene: Similarity,
-    /// The lens.
+    /// Adjusted lens.
     pub lens: Intrinsics,
-    /// How long it took to expose all rows of an image; `None` if that was not asked.
+    /// Readout time of an image's rows; `None` if not estimated.
     pub readout: Option<Readout>,
-    /// Poses, of an image's middle row, in the order of the images. [m, world]
+    /// Pose of each image's middle row, in the order of the images. [m, world]
     pub world_from_cam: Vec<Pose<World, Cam>>,
-    /// Points, in the order of the capture's. [m, world]
+    /// Points, in the order of the capture. [m, world]
     pub points_m: Vec<DVec3>,
-    /// How far points are from where images saw them, root mean square without outliers. [px]
+    /// RMS reprojection error of the points, without outliers. [px]
     pub points_rms_px: f64,
-    /// Sightings of points that fit worse than three sigmas, as a share.
+    /// Fraction of sightings with an error above three sigmas.
     pub points_outliers: f64,
-    /// How far tracked points are from where the cameras have them, root mean square; `None` without. [m]
+    /// RMS distance between measured positions and the cameras' tracked point; `None` without measured positions. [m]
     pub places_rms_m: Option<f64>,
-    /// Tags, in the order of the capture's; `None` of one that too few images saw.
+    /// Tags, in the order of the capture; `None` if too few images saw the tag.
     pub tags: Vec<Option<TagResult>>,
-    /// How far inside tags their corners are found: white bleeds into black. More than half a pixel is no bleeding, but
-    /// prints of another size. [px]
+    /// Distance by which corners are detected inside the tags, because white bleeds into black. More than half a pixel
+    /// means a wrong print size instead. [px]
     pub inset_px: f64,
-    /// Of the scale, as a share of it, one sigma; `None` if nothing tells it.
+    /// Relative standard deviation of the scale; `None` if undetermined.
     pub scale_sigma: Option<f64>,
-    /// Of the vertical, the worse direction, one sigma; `None` if nothing tells it. [rad]
+    /// Standard deviation of the vertical in the worse direction; `None` if undetermined. [rad]
     pub tilt_sigma_rad: Option<f64>,
-    /// Rounds until nothing changed.
+    /// Number of iterations.
     pub rounds: usize,
 }
 
-/// What outside knowledge tells of a capture.
+/// Quantities determined by measurements outside structure from motion.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Known {
-    /// Lengths.
+    /// Metric scale.
     pub scale: bool,
-    /// The vertical.
+    /// Vertical.
     pub up: bool,
-    /// The place in the room, heading too.
+    /// Position and heading in the room.
     pub place: bool,
 }
 
-/// How long rows take.
+/// Readout time of a rolling shutter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Readout {
-    /// From the first row's exposure to the last one's; negative of a phone held upside down. [s]
+    /// Time from the first row's exposure to the last one's; negative for a phone held upside down. [s]
     pub seconds: f64,
-    /// One sigma. [s]
+    /// Standard deviation. [s]
     pub sigma_s: f64,
 }
 
-/// How a tag fits.
+/// Residuals of a tag.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TagResult {
-    /// Images that saw it.
+    /// Number of images that saw the tag.
     pub sightings: usize,
-    /// Images that saw it somewhere else: misread, or another tag of the same number.
+    /// Number of images that saw the tag elsewhere: misread, or another tag with the same number.
     pub contradicting: usize,
-    /// Where its corners are. [m, world]
+    /// Adjusted corners. [m, world]
     pub corners_m: [DVec3; 4],
-    /// How far they are from where images saw them, root mean square of sightings that agree. [px]
+    /// RMS reprojection error of the agreeing sightings. [px]
     pub rms_px: f64,
-    /// What it says where it had no say.
+    /// Result of the validation without this tag.
     pub held_out: Option<HeldOut>,
 }
 
-/// Where a tag is by images alone, placed by all other tags.
+/// Position of a tag triangulated from images only, with poses adjusted by the other tags.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HeldOut {
-    /// From where it was measured to be: its middle. `None` if that was not measured. [m]
+    /// Distance of the tag's centre from its measured position; `None` if unmeasured. [m]
     pub off_m: Option<f64>,
-    /// How far its middle may be off by a pixel in each image that saw it: much, where few saw it, or from one side. [m]
+    /// Error of the centre per pixel of error in each image; large if few images saw the tag, or all from one side. [m]
     pub by_pixel_m: f64,
-    /// Its edges, as a share of what they were measured to be, less 1.
+    /// Relative error of the edge length: 0 is exact.
     pub size_error: f64,
-    /// How far it is from where images saw it, root mean square. [px]
+    /// RMS reprojection error. [px]
     pub rms_px: f64,
 }
 
-/// Why a capture could not be adjusted.
+/// Why a capture cannot be adjusted.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum AdjustError {
-    /// A number that is none, or a sighting of what is not there.
-    #[error("{0} is not a number that can be meant")]
+    /// A value that is not finite or out of range, or a sighting of a missing point or tag.
+    #[error("{0} is out of range")]
     BadNumber(&'static str),
-    /// Too little to adjust.
+    /// Too few images or points.
     #[error(
         "{images} placed images and {points} points are too little; at least 3 images that share 20 points are needed"
     )]
     TooLittle {
-        /// Images.
+        /// Number of images.
         images: usize,
-        /// Points that at least two of them saw.
+        /// Number of points seen by at least two images.
         points: usize,
     },
-    /// Measured places contradict structure from motion.
-    #[error("where {what} are contradicts where the images see them: {cause}")]
+    /// Measured positions contradict structure from motion.
+    #[error("measured positions of {what} contradict the images: {cause}")]
     Contradictory {
-        /// Tags or places.
+        /// Kind of the measured things.
         what: &'static str,
-        /// How.
+        /// Cause.
         cause: AlignError,
     },
     /// The normal equations have no solution.
@@ -161,12 +162,12 @@ pub enum AdjustError {
     Undetermined,
 }
 
-/// Adjusts a capture: robust least squares over everything at once.
+/// Adjusts a capture by robust least squares over all unknowns together.
 ///
-/// Deterministic: the same on any number of threads.
+/// The result does not depend on the number of threads.
 ///
 /// # Errors
-/// [`AdjustError`] says what is wrong with the capture, and what to film again.
+/// [`AdjustError`], which names the fault and what to film again.
 pub fn adjust(capture: &Capture, options: Options) -> Result<Adjusted, AdjustError> {
     let (start, known) = start::start(capture)?;
     let mut state = state::State::new(capture, &start);

@@ -1,7 +1,9 @@
-//! The normal equations of everything but the points, which are eliminated as they come (Triggs et al. 2000, "Bundle
-//! adjustment: a modern synthesis", section 6.1): by orthonormal bases of what their moves change in images, as a point
-//! just before a camera, or far from all, would drown the others in rounding if its own equations were inverted (Demmel
-//! et al. 2021, "Square root bundle adjustment").
+//! Normal equations of all unknowns except the points, which are eliminated (Triggs et al. 2000, "Bundle adjustment: a
+//! modern synthesis", section 6.1).
+//!
+//! The elimination uses orthonormal bases of the points' Jacobians. Inverting a point's own equations would let a point
+//! very close to a camera, or far from all, spoil the others by rounding (Demmel et al. 2021, "Square root bundle
+//! adjustment").
 
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
@@ -14,27 +16,27 @@ use super::rolling::{READOUT_S, Slopes};
 use super::solve::Problem;
 use super::state::{State, TagPlace, inwards};
 
-/// Matrix and gradient, and what it all costs.
+/// Matrix and gradient of the normal equations.
 pub(super) struct Normal {
     pub(super) matrix: Symmetric,
     pub(super) gradient: Vec<f64>,
 }
 
-/// What all images share: the lens's numbers, and the readout of their rows.
+/// Number of unknowns common to all images: the lens's parameters and the readout time.
 pub(super) const SHARED: usize = LENS + 1;
 
-/// Where the unknowns stand.
+/// Indices of the unknowns.
 #[derive(Clone, Debug)]
 pub(super) struct Layout {
-    /// Unknowns of a camera: place, turn, and the bend of one whose shutter rolls.
+    /// Unknowns per camera: position, rotation, and, with a rolling shutter, the bend.
     pub(super) camera: usize,
-    /// `None` if all of it is given.
+    /// Index of the common unknowns; `None` if all are given.
     pub(super) shared: Option<usize>,
-    /// Which of it is found.
+    /// For each common unknown, whether it is estimated.
     free: [bool; SHARED],
-    /// `None` if there are no tags.
+    /// Index of the inset; `None` without tags.
     pub(super) inset: Option<usize>,
-    /// Of each tag; `None` of one that is not to be found.
+    /// Index of each tag's pose; `None` if it is not estimated.
     pub(super) tags: Vec<Option<usize>>,
     pub(super) size: usize,
 }
@@ -59,25 +61,25 @@ impl Layout {
         Self { camera, shared, free, inset, tags, size }
     }
 
-    /// Returns where the readout stands, if it is found.
+    /// Returns the index of the readout time, if estimated.
     pub(super) fn readout(&self) -> Option<usize> {
         self.shared.filter(|_| self.free[LENS]).map(|at| at + LENS)
     }
 
-    /// Returns where the principal point stands, if it is found.
+    /// Returns the indices of the principal point, if estimated.
     pub(super) fn middle(&self) -> Vec<usize> {
         let at = self.shared.filter(|_| self.free[LENS - 1]);
         at.map_or(Vec::new(), |at| vec![at + LENS - 2, at + LENS - 1])
     }
 
-    /// Returns derivatives by what is shared, none by what is given.
+    /// Returns derivatives by the common unknowns; zero for those that are given.
     fn by_shared(&self, by_lens: [DVec2; LENS], by_readout: DVec2) -> [DVec2; SHARED] {
         let mut by = std::array::from_fn(|i| if i < LENS { by_lens[i] } else { by_readout });
         by.iter_mut().zip(self.free).filter(|(_, free)| !free).for_each(|(d, _)| *d = DVec2::ZERO);
         by
     }
 
-    /// Returns it without the unknowns of some tags.
+    /// Removes the unknowns of some tags.
     pub(super) fn without(mut self, tags: &[usize]) -> Self {
         for &tag in tags {
             if let Some(gone) = self.tags[tag].take() {
@@ -94,7 +96,7 @@ impl Normal {
         Self { matrix: Symmetric::zero(size), gradient: vec![0.0; size] }
     }
 
-    /// Adds one residual whose derivatives by a few blocks of unknowns, ascending, are given.
+    /// Adds one residual with its derivatives by some blocks of unknowns, in ascending order.
     fn add(&mut self, blocks: &[(usize, &[f64])], residual: f64, weight: f64) {
         for (index, &(row, by_row)) in blocks.iter().enumerate() {
             for (i, a) in by_row.iter().enumerate() {
@@ -111,7 +113,7 @@ impl Normal {
         }
     }
 
-    /// Makes steps along a direction of all unknowns cost something.
+    /// Penalises steps along a direction of the unknowns.
     pub(super) fn hold(&mut self, direction: &[f64], weight: f64) {
         for (row, a) in direction.iter().enumerate().filter(|(_, a)| **a != 0.0) {
             for (column, b) in direction[..=row].iter().enumerate() {
@@ -121,26 +123,27 @@ impl Normal {
     }
 }
 
-/// One sighting of a point, with its derivatives times the root of its weight.
+/// One sighting of a point, with derivatives multiplied by the square root of its weight.
 struct Seen<const N: usize> {
     camera: usize,
     by_camera: [DVec2; N],
     by_shared: [DVec2; SHARED],
-    /// Its rows of the basis of what the point's moves change.
+    /// Rows of the basis of the point's Jacobian that belong to this sighting.
     basis: [DVec2; 3],
     residual: DVec2,
 }
 
-/// A point's own part of the equations.
+/// Part of the equations that belongs to one point.
 struct PointPart<const N: usize> {
-    /// Takes moves of the point to the basis.
+    /// Transforms moves of the point to the basis.
     basis_from_move: DMat3,
-    /// Of all residuals, along the basis.
+    /// Residuals projected onto the basis.
     residual: DVec3,
     seen: Vec<Seen<N>>,
 }
 
-/// Returns it; `None` where its sightings do not place it, it is seen by fewer than two, or is at a camera.
+/// Returns the part of a point; `None` if its sightings do not determine its position: fewer than two, or the point is
+/// at a camera.
 fn part<const N: usize>(
     problem: &Problem,
     state: &State,
@@ -150,7 +153,7 @@ fn part<const N: usize>(
     let sightings = problem.sightings(point);
     let mut seen = Vec::with_capacity(sightings.len());
     let mut columns = [const { Vec::new() }; 3];
-    // By how much images change with the point. [px^2/m^2]
+    // Minimum and maximum change of the images with the point. [px^2/m^2]
     let (mut least, mut greatest) = (f64::MAX, 0.0f64);
     for &(camera, pixel) in sightings {
         let Some((projected, in_row)) = state.see(camera, state.points[point], pixel) else {
@@ -176,7 +179,7 @@ fn part<const N: usize>(
     if seen.len() < 2 || greatest > BEFORE_THE_NOSE.powi(2) * least {
         return None;
     }
-    // Damping is as if each number of the point had been measured to be what it is.
+    // Damping acts as if each coordinate of the point had been measured at its present value.
     let by_itself = columns.each_ref().map(|column| {
         let length2: f64 = column.iter().map(|d| d.length_squared()).sum();
         (damping * length2).sqrt()
@@ -194,7 +197,7 @@ fn part<const N: usize>(
     Some(PointPart { basis_from_move, residual, seen })
 }
 
-/// Returns how much of a change in an image a move of the point makes too.
+/// Returns the component of an image change that a move of the point could also cause.
 fn along(change: DVec2, basis: &[DVec2; 3]) -> DVec3 {
     DVec3::from_array(basis.map(|row| change.dot(row)))
 }
@@ -207,11 +210,11 @@ fn outer<const R: usize, const C: usize>(a: &[DVec2; R], b: &[DVec2; C]) -> [[f6
     std::array::from_fn(|i| std::array::from_fn(|j| a[i].dot(b[j])))
 }
 
-/// Returns the normal equations at a state, points eliminated with this damping of their own.
+/// Returns the normal equations at a state, with points eliminated. `damping` applies to the points.
 pub(super) fn normal(problem: &Problem, state: &State, damping: f64) -> Normal {
     let layout = &problem.layout;
     let add = if layout.camera == STILL { add_point::<STILL> } else { add_point::<ROLLING> };
-    // Parts whose number does not depend on threads: sums are the same on any machine.
+    // The number of parts does not depend on the number of threads, so sums are the same on any machine.
     let parts = (PARTS_BYTES / (4 * layout.size * layout.size).max(1)).clamp(1, PARTS);
     let size = state.points.len().div_ceil(parts).max(1);
     let parts: Vec<Normal> = (0..parts)
@@ -256,7 +259,7 @@ fn add_point<const N: usize>(
         }
         sum.matrix.add_block(row, row, &outer(&one.by_camera, &one.by_camera));
         for (other, other_along) in part.seen.iter().zip(&all_along) {
-            // The lower triangle of the matrix.
+            // Only the lower triangle.
             if other.camera <= one.camera {
                 sum.matrix.add_block(row, N * other.camera, &products(one_along, other_along));
             }
@@ -332,7 +335,7 @@ fn add_priors(sum: &mut Normal, capture: &Capture, problem: &Problem, state: &St
     }
     for (i, free) in problem.layout.free.iter().enumerate() {
         if let Some(shared) = problem.layout.shared.filter(|_| !free) {
-            // What is given stays.
+            // Given values stay constant.
             sum.matrix.add(shared + i, shared + i, 1.0);
         }
     }
@@ -376,7 +379,7 @@ fn add_priors(sum: &mut Normal, capture: &Capture, problem: &Problem, state: &St
     }
 }
 
-/// Returns how points move, given the change of everything else.
+/// Returns the moves of the points, given the change of all other unknowns.
 pub(super) fn points_step(
     problem: &Problem,
     state: &State,
@@ -415,14 +418,14 @@ fn point_step<const N: usize>(
     -(part.basis_from_move.inverse() * right)
 }
 
-/// Place and turn.
+/// Unknowns per camera: position and rotation.
 const STILL: usize = 6;
-/// And a bend.
+/// Unknowns per camera with a rolling shutter: also the bend.
 const ROLLING: usize = 9;
 
-/// So many times nearer to one camera than to another a point is a mismatch, and rounding all that it tells.
+/// Maximum ratio of a point's distances to its cameras. Beyond it the point is a mismatch, dominated by rounding.
 const BEFORE_THE_NOSE: f64 = 1e4;
-/// More threads than most machines of a lab have: each has a matrix of half of size^2 numbers.
+/// Maximum number of parts, more than the threads of most lab machines. Each part has a matrix of size^2 / 2 numbers.
 const PARTS: usize = 16;
-/// Of all matrices: 300 images take 30 MB each.
+/// Maximum memory of all matrices: 300 images need 30 MB each. [bytes]
 const PARTS_BYTES: usize = 1 << 29;

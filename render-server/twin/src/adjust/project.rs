@@ -1,23 +1,23 @@
-//! Projection with its derivatives by the point in the camera and by the lens.
+//! Projection and its derivatives by the point and the lens.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics};
 
-/// Numbers of a lens that are found: the logarithm of both focal lengths, the first two radial coefficients, the principal
-/// point. That is hard to tell from a turn of the camera; held where structure from motion supposes it, in the image's
-/// middle, it passes for a shutter that rolls slower or faster.
+/// Number of estimated lens parameters: logarithm of both focal lengths, the first two radial coefficients, and the
+/// principal point. The principal point is hard to distinguish from a camera rotation. But if it were fixed at the
+/// image's centre, as structure from motion assumes, its error would bias the readout time.
 pub(super) const LENS: usize = 5;
 
 /// A point in an image.
 pub(super) struct Projected {
     pub(super) pixel: DVec2,
-    /// By x, y, z of the point. [px/m]
+    /// Derivatives by x, y, z of the point. [px/m]
     pub(super) by_point: [DVec2; 3],
-    /// By the lens's numbers.
+    /// Derivatives by the lens's parameters.
     pub(super) by_lens: [DVec2; LENS],
 }
 
-/// Returns where a point [m, cam] appears; `None` if that is not ahead, or beyond the lens's reach.
+/// Projects a point [m, cam]; `None` if it is not ahead, or beyond the lens's range.
 pub(super) fn project(k: &Intrinsics, reach: f64, p_cam: DVec3) -> Option<Projected> {
     if !(p_cam.z > 0.0) {
         return None;
@@ -39,7 +39,7 @@ pub(super) fn project(k: &Intrinsics, reach: f64, p_cam: DVec3) -> Option<Projec
         Distortion::None | Distortion::BrownConrady { .. } => [slope * rr, slope * (rr * rr)],
         Distortion::KannalaBrandt { .. } => {
             let r = rr.sqrt();
-            // Near the axis t^3 / r is r^2.
+            // Near the axis, t^3 / r is r^2.
             let unit = if r > 1e-9 { slope / r } else { DVec2::ZERO };
             [3, 5].map(|power| unit * r.atan().powi(power))
         }
@@ -49,7 +49,7 @@ pub(super) fn project(k: &Intrinsics, reach: f64, p_cam: DVec3) -> Option<Projec
     pixel.is_finite().then_some(Projected { pixel, by_point, by_lens })
 }
 
-/// Returns the lens with its numbers changed.
+/// Returns the lens with changed parameters.
 pub(super) fn moved(k: &Intrinsics, change: &[f64; LENS]) -> Intrinsics {
     let [zoom, by1, by2, x_px, y_px] = *change;
     let distortion = match k.distortion {
@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn derivatives_are_the_slopes_of_the_projection() {
+    fn derivatives_match_finite_differences() {
         let pinhole = Intrinsics::from_horizontal_fov(640, 480, 1.2);
         for distortion in [
             Distortion::None,
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_behind_or_beyond_the_lens_is_not_seen() {
+    fn rejects_points_behind_or_beyond_the_lens() {
         let k = Intrinsics::from_horizontal_fov(640, 480, 1.2);
         assert!(project(&k, 3.0, DVec3::NEG_Z).is_none());
         assert!(project(&k, 3.0, DVec3::new(4.0, 0.0, 1.0)).is_none());

@@ -1,9 +1,9 @@
-//! A rolling shutter: rows are exposed one after the other, from poses that the camera passes meanwhile.
+//! Rolling shutter: rows are exposed one after the other, from different camera poses.
 //!
-//! An image's pose is that of its middle row. Another row's follows from how the camera moves, which its neighbours in
-//! time tell: the mean of the speeds to the one before and to the one after. A hand's step and tremor are faster than
-//! that, so each image has a turn of its own besides, which costs what a hand turns (Albl et al. 2016, "Degeneracies in
-//! rolling shutter SfM": with free turns, rooms would collapse to a plane).
+//! An image's pose is that of its middle row. The poses of other rows follow from the camera's velocity: the mean of
+//! the velocities to the previous and to the next image. Steps and tremor of a hand are faster than that, so each image
+//! has an additional rotation (bend), with a prior from hand motion (Albl et al. 2016, "Degeneracies in rolling shutter
+//! SfM": with free rotations, rooms would collapse to a plane).
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
@@ -11,19 +11,19 @@ use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 use super::capture::Capture;
 use super::robust::median;
 
-/// How rows follow each other, and how the camera moves meanwhile.
+/// Readout time, and the cameras' motion during it.
 #[derive(Clone, Debug)]
 pub(super) struct Rolling {
-    /// From the first row's exposure to the last one's; negative of a phone held upside down. [s]
+    /// Time from the first row's exposure to the last one's; negative for a phone held upside down. [s]
     pub(super) readout_s: f64,
-    /// By how much each camera turns from the first row to the last beyond what its neighbours tell. [rad, cam]
+    /// Rotation of each camera from the first row to the last, in addition to that from its velocity. [rad, cam]
     pub(super) bends_rad: Vec<DVec3>,
-    /// Of each camera.
+    /// Velocity of each camera.
     motions: Vec<CameraVelocity>,
     height_px: f64,
 }
 
-/// How a camera moves.
+/// Velocity of a camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct CameraVelocity {
     /// [1/s of the state's lengths, world]
@@ -32,26 +32,26 @@ struct CameraVelocity {
     omega_cam: DVec3,
 }
 
-/// How far a camera has come when a row is exposed.
+/// Motion of a camera at the exposure of a row.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Row {
-    /// Of the image's height, from its middle: -0.5 to 0.5.
+    /// Position of the row relative to the middle, in image heights: -0.5 to 0.5.
     pub(super) share: f64,
     shift_world: DVec3,
     turn_rad: DVec3,
     motion: CameraVelocity,
 }
 
-/// A point in the camera, as a row sees it.
+/// A point in the camera frame at the exposure of a row.
 pub(super) struct InRow {
     pub(super) p_cam: DVec3,
-    /// Before the camera turned on.
+    /// Position before the camera's rotation since the middle row.
     p_middle: DVec3,
     row: Row,
 }
 
 impl Rolling {
-    /// Returns a shutter that is not known to roll.
+    /// Returns a shutter with a readout time of 0.
     pub(super) fn new(lens: &Intrinsics, images: usize) -> Self {
         Self {
             readout_s: 0.0,
@@ -61,12 +61,12 @@ impl Rolling {
         }
     }
 
-    /// Takes motions anew from where cameras are now.
+    /// Updates the velocities from the present poses.
     pub(super) fn follow(&mut self, capture: &Capture, cameras: &[Pose<World, Cam>]) {
         self.motions = motions(capture, cameras);
     }
 
-    /// Returns how far a camera has come when this pixel is exposed.
+    /// Returns the camera's motion at the exposure of a pixel.
     pub(super) fn row(&self, camera: usize, pixel: DVec2) -> Row {
         let share = (pixel.y / self.height_px - 0.5).clamp(-0.5, 0.5);
         let motion = self.motions[camera];
@@ -79,20 +79,20 @@ impl Rolling {
         }
     }
 
-    /// Returns one sigma of the bends: by what a hand turns. [rad]
+    /// Returns the prior standard deviation of the bends, from hand motion. [rad]
     pub(super) fn bend_sigma_rad(&self) -> f64 {
         (self.readout_s.abs() * HAND_RADPS).max(LEAST_BEND_RAD)
     }
 }
 
 impl Row {
-    /// Returns the camera's pose when the row is exposed.
+    /// Returns the camera's pose at the exposure of the row.
     pub(super) fn pose(&self, middle: &Pose<World, Cam>) -> Pose<World, Cam> {
         let turned = middle.rotation * DQuat::from_scaled_axis(self.turn_rad);
         Pose::new(middle.translation_m + self.shift_world, turned)
     }
 
-    /// Returns where a point of the world is in the camera.
+    /// Transforms a point of the world into the camera frame.
     pub(super) fn see(self, middle: &Pose<World, Cam>, p_world: DVec3) -> InRow {
         let p_middle =
             middle.rotation.conjugate() * (p_world - middle.translation_m - self.shift_world);
@@ -105,7 +105,8 @@ impl Row {
     }
 }
 
-/// Derivatives of a pixel by a camera's place, its turn about its own axes and its bend; by the point; by the readout.
+/// Derivatives of a pixel by the camera's position, its rotation about its own axes and its bend; by the point; by the
+/// readout time.
 pub(super) struct Slopes {
     pub(super) by_camera: [DVec2; 9],
     pub(super) by_point: [DVec2; 3],
@@ -113,16 +114,16 @@ pub(super) struct Slopes {
 }
 
 impl InRow {
-    /// Returns them, given the derivatives by the point in the camera.
+    /// Returns the derivatives, given those by the point in the camera frame.
     pub(super) fn slopes(&self, middle: &Pose<World, Cam>, by_cam: &[DVec2; 3]) -> Slopes {
         let through = |v: DVec3| by_cam[0] * v.x + by_cam[1] * v.y + by_cam[2] * v.z;
         let Row { share, turn_rad, motion, .. } = self.row;
         let on = DMat3::from_quat(DQuat::from_scaled_axis(-turn_rad));
         let cam_from_world = on * DMat3::from_quat(middle.rotation.conjugate());
         let [x, y, z] = DVec3::AXES.map(|axis| through(cam_from_world * axis));
-        // The camera turned by a small w sees the point turned by -w: p + p x w.
+        // A camera rotated by a small w sees the point rotated by -w: p + p x w.
         let turn = DVec3::AXES.map(|axis| through(on * self.p_middle.cross(axis)));
-        // A turn by phi and a small d after one another, of phi + d: the right Jacobian (Solà et al. 2018, eq. 143).
+        // Rotation by phi + d as a rotation by phi and a small one: the right Jacobian (Solà et al. 2018, eq. 143).
         let jacobian = |d: DVec3| {
             let once = turn_rad.cross(d);
             d - once / 2.0 + turn_rad.cross(once) / 6.0
@@ -136,8 +137,8 @@ impl InRow {
     }
 }
 
-/// Returns how cameras move: the mean of the speeds from the image before and to the image after, as far as these are
-/// near in time; nothing of what stands alone, or leaps.
+/// Returns the cameras' velocities: the mean of those from the previous and to the next image, if close in time. The
+/// velocity is zero for isolated images and for leaps.
 fn motions(capture: &Capture, cameras: &[Pose<World, Cam>]) -> Vec<CameraVelocity> {
     let between = |a: usize| -> Option<CameraVelocity> {
         let (before, after) = (cameras[a], *cameras.get(a + 1)?);
@@ -170,18 +171,18 @@ fn motions(capture: &Capture, cameras: &[Pose<World, Cam>]) -> Vec<CameraVelocit
         .collect()
 }
 
-/// How readouts are spread, before anything is seen: phones take 10 to 33 ms. [s]
+/// Prior standard deviation of the readout time: phones take 10 to 33 ms. [s]
 pub(super) const READOUT_S: f64 = 0.03;
-/// An image is read while the next one waits: 24 a second are the fewest that phones film. [s]
+/// Maximum readout time: less than the interval of images, and phones film at least 24 per second. [s]
 pub(super) const MOST_READOUT_S: f64 = 0.042;
-/// A hand that walks turns by this beyond what pictures a third of a second apart show, about each axis: in generated
-/// walks 0.03 to 0.07, root mean square; people are less steady. [rad/s]
+/// Standard deviation of the rotation rate of a walking hand that images a third of a second apart do not show, about
+/// each axis. Generated walks have 0.03 to 0.07 RMS; people are less steady. [rad/s]
 const HAND_RADPS: f64 = 0.15;
-/// Less is nothing. [rad]
+/// Minimum standard deviation of a bend. [rad]
 const LEAST_BEND_RAD: f64 = 1e-6;
-/// Images farther apart do not tell how the camera moves. [s]
+/// Maximum interval of images that determine a velocity. [s]
 const GAP_S: f64 = 1.5;
-/// Of the usual speed: more is no walk, but a place that is wrong.
+/// Maximum ratio to the median speed: a faster move is a wrong pose.
 const LEAP: f64 = 5.0;
-/// No hand that films turns faster. [rad/s]
+/// Maximum rotation rate of a hand that films. [rad/s]
 const MOST_RADPS: f64 = 3.0;

@@ -1,4 +1,4 @@
-//! Levenberg and Marquardt's iteration, and what sightings weigh in it.
+//! Levenberg-Marquardt iteration, and weights of the sightings.
 
 use glam::{DQuat, DVec2, DVec3};
 use rayon::prelude::*;
@@ -13,37 +13,37 @@ use super::rolling::{MOST_READOUT_S, READOUT_S};
 use super::state::{State, TagPlace};
 use super::{AdjustError, Known, Options};
 
-/// What is minimised.
+/// The minimised problem.
 pub(super) struct Problem<'a> {
     pub(super) capture: &'a Capture,
     pub(super) layout: Layout,
     pub(super) noise: Noise,
-    /// Sightings of points, those of one after the other: (camera, pixel).
+    /// Sightings of points as (camera, pixel), grouped by point.
     seen: Vec<(usize, DVec2)>,
-    /// Where each point's begin.
+    /// Start of each point's sightings in `seen`.
     starts: Vec<usize>,
-    /// Sightings of tags that count.
+    /// Sightings of tags that are used.
     pub(super) tags: Vec<(usize, &'a TagSighting)>,
 }
 
-/// How far sightings are off along an axis, one sigma, as they are found to be. Losses are Cauchy's: what is farther off
-/// than three sigmas hardly pulls.
+/// Estimated standard deviations of sightings along an axis. The loss is Cauchy's, so errors above three sigmas have
+/// little influence.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Noise {
     pub(super) point_px: f64,
     pub(super) tag_px: f64,
-    /// By how much places are worse than they claim; at least 1.
+    /// Ratio of the measured positions' actual to their claimed error; at least 1.
     pub(super) place_factor: f64,
-    /// What a camera turns from the first row to the last, beyond what its neighbours tell. [rad]
+    /// Rotation of a camera from the first row to the last, in addition to that from its velocity. [rad]
     pub(super) bend_rad: f64,
 }
 
-/// What was found.
+/// Result of the solver.
 pub(super) struct Solved {
     pub(super) noise: Noise,
     pub(super) rounds: usize,
     pub(super) layout: Layout,
-    /// Of the normal equations at the end, with held what nothing tells.
+    /// Factor of the final normal equations; undetermined directions are held.
     pub(super) factor: Factor,
 }
 
@@ -53,7 +53,7 @@ impl Noise {
         Self { point_px: 1.0, tag_px: 0.5, place_factor: 1.0, bend_rad }
     }
 
-    /// Returns it, with sigmas that are at most a few times smaller than the last.
+    /// Limits the decrease of the sigmas since the last estimate.
     fn no_sharper_than(self, last: Self) -> Self {
         Self {
             point_px: self.point_px.max(SHARPER * last.point_px),
@@ -71,7 +71,7 @@ impl Noise {
             && near(self.bend_rad, last.bend_rad)
     }
 
-    /// Returns 1 / sigma^2, less for what is far off. [1/px^2]
+    /// Returns 1 / sigma^2, reduced for outliers. [1/px^2]
     pub(super) fn point_weight(&self, off_px: DVec2) -> f64 {
         weight(off_px.length(), self.point_px)
     }
@@ -86,7 +86,7 @@ impl Noise {
 }
 
 impl<'a> Problem<'a> {
-    /// `without` are tags whose sightings do not count.
+    /// Creates a problem; sightings of the tags in `without` are ignored.
     pub(super) fn new(
         capture: &'a Capture,
         state: &State,
@@ -114,7 +114,7 @@ impl<'a> Problem<'a> {
             };
             tags.extend(image.tags.iter().filter(counts).map(|seen| (camera, seen)));
         }
-        // A tag that nothing sees any more has no place to be found.
+        // Tags without sightings have no unknowns.
         let layout = Layout::new(state, refine_lens, rolling).without(without);
         Self { capture, layout, noise: Noise::start(state), seen, starts, tags }
     }
@@ -132,7 +132,7 @@ impl<'a> Problem<'a> {
         if sightings.len() < 2 { 0.0 } else { sightings.iter().map(one).sum() }
     }
 
-    /// Returns what a state costs.
+    /// Returns the cost of a state.
     pub(super) fn cost(&self, state: &State) -> f64 {
         let points: Vec<f64> = (0..state.points.len())
             .into_par_iter()
@@ -168,12 +168,12 @@ impl<'a> Problem<'a> {
         sum
     }
 
-    /// Returns how far off sightings are: by medians, which a few that are wrong do not move.
+    /// Estimates the noise by medians, which a few outliers do not move.
     fn noise_of(&self, state: &State) -> Noise {
         let points = (0..state.points.len()).flat_map(|point| {
             let sightings = self.sightings(point);
             let many = if sightings.len() < 3 { &[] } else { sightings };
-            // Of what its sightings say, three numbers went into the point.
+            // Three parameters of the point were fitted to its own sightings.
             let numbers = 2.0 * sightings.len() as f64;
             let went_in = (numbers / (numbers - 3.0)).sqrt();
             many.iter().filter_map(move |&(camera, pixel)| {
@@ -189,8 +189,7 @@ impl<'a> Problem<'a> {
             Some(at_m.distance(place.position_m) / place.sigma_m)
         });
         Noise {
-            // The median length of two normal numbers is 1.18 sigmas, of three 1.54; that of the root mean square of
-            // four corners' 1.35.
+            // Median length in sigmas: 1.18 for two normal numbers, 1.54 for three, 1.35 for the RMS of four corners.
             point_px: median(points).map_or(1.0, |px| (px / 1.18).max(LEAST_PX)),
             tag_px: median(tags).map_or(0.5, |px| (px / 1.35).max(LEAST_PX)),
             place_factor: median(places).map_or(1.0, |share| (share / 1.54).max(1.0)),
@@ -199,7 +198,7 @@ impl<'a> Problem<'a> {
     }
 }
 
-/// Finds the nearest minimum, and leaves it in the state.
+/// Finds the nearest minimum, and stores it in the state.
 pub(super) fn solve(
     capture: &Capture,
     state: &mut State,
@@ -208,8 +207,8 @@ pub(super) fn solve(
 ) -> Result<Solved, AdjustError> {
     let mut problem = Problem::new(capture, state, options.refine_lens, options.rolling, &[]);
     let mut rounds = 0;
-    // What weighs how much is known only once it fits; weights that sharpen at once would leave behind what is not there
-    // yet.
+    // The noise is known only after a fit. Limit its decrease: weights that sharpen at once would reject sightings that
+    // do not fit yet.
     for _ in 0..MAX_NOISES {
         state.rolling.follow(capture, &state.cameras);
         rounds += iterate(&problem, state, known, 1e-5)?;
@@ -227,7 +226,7 @@ pub(super) fn solve(
     Ok(Solved { noise: problem.noise, rounds, layout: problem.layout, factor })
 }
 
-/// Goes on from a solution without the sightings of some tags.
+/// Continues from a solution without the sightings of some tags.
 pub(super) fn settle(
     capture: &Capture,
     state: &mut State,
@@ -243,7 +242,7 @@ pub(super) fn settle(
     iterate(&problem, state, known, 1e-6)
 }
 
-/// Goes on until a round gains less than a share of the cost; returns rounds.
+/// Iterates until a round reduces the cost by less than a fraction; returns the number of rounds.
 fn iterate(
     problem: &Problem,
     state: &mut State,
@@ -277,7 +276,7 @@ fn iterate(
             _ => {
                 damping *= 8.0;
                 if damping > GIVE_UP {
-                    // Where no step helps is a minimum, unless no step could be made.
+                    // If no step helps, this is a minimum, unless no step could be computed.
                     return if tried.is_some() {
                         Ok(round)
                     } else {
@@ -290,12 +289,12 @@ fn iterate(
     Ok(MAX_ROUNDS)
 }
 
-/// Adds what nothing tells: all may be shifted, turned and scaled at no cost, and is held where it is.
+/// Holds undetermined directions (shift, rotation and scale of everything) at their present value.
 fn held(mut normal: Normal, state: &State, layout: &Layout, known: Known) -> Normal {
     if known.place {
         return normal;
     }
-    // Of places and turns: what else there is may be held by far more.
+    // Mean over positions and rotations; other unknowns may have much larger weights.
     let cameras = (0..state.cameras.len()).map(|camera| layout.camera * camera);
     let mean: f64 = cameras.flat_map(|at| at..at + 6).map(|i| normal.matrix.diagonal(i)).sum();
     for direction in free_directions(state, layout, known) {
@@ -305,7 +304,7 @@ fn held(mut normal: Normal, state: &State, layout: &Layout, known: Known) -> Nor
     normal
 }
 
-/// Returns changes of all unknowns that change nothing in the images.
+/// Returns changes of all unknowns that leave the images unchanged.
 fn free_directions(state: &State, layout: &Layout, known: Known) -> Vec<Vec<f64>> {
     let middle = middle_m(state);
     let make = |shift: &dyn Fn(DVec3) -> DVec3, turn: DVec3| {
@@ -327,7 +326,7 @@ fn free_directions(state: &State, layout: &Layout, known: Known) -> Vec<Vec<f64>
     all
 }
 
-/// Returns the middle of all cameras. [m, world]
+/// Returns the centroid of all cameras. [m, world]
 pub(super) fn middle_m(state: &State) -> DVec3 {
     let sum: DVec3 = state.cameras.iter().map(|pose| pose.translation_m).sum();
     sum / state.cameras.len() as f64
@@ -370,16 +369,17 @@ pub(super) fn stepped(state: &State, layout: &Layout, change: &[f64], points: &[
     }
 }
 
-/// From a pixel to the least sigma, and some more.
+/// Maximum number of noise estimates: enough from one pixel to the minimum sigma.
 const MAX_NOISES: usize = 8;
 const SHARPER: f64 = 0.4;
-/// Far more than any problem that converges takes.
+/// Maximum number of rounds, far more than a converging problem takes.
 const MAX_ROUNDS: usize = 60;
-/// Damping beyond which no step will help.
+/// Damping above which no step will help.
 const GIVE_UP: f64 = 1e8;
-/// Bounds what nothing determines, such as an image of few points; what is determined it does not touch.
+/// Damping that bounds undetermined unknowns, for example of an image with few points; determined ones are not
+/// affected.
 const ALMOST_NONE: f64 = 1e-8;
-/// What is behind its camera counts as. [px]
+/// Error of a point behind its camera. [px]
 const BEHIND_PX: f64 = 1e4;
-/// Nothing is found in an image better than this. [px]
+/// Minimum sigma of sightings. [px]
 const LEAST_PX: f64 = 0.02;

@@ -1,4 +1,4 @@
-//! Where the adjustment starts: a similarity from structure from motion's frame to metres.
+//! Initial similarity transform from structure from motion's frame to metres.
 
 use glam::{DQuat, DVec3};
 
@@ -9,15 +9,15 @@ use crate::align::corners::{Ray, meet_within};
 use crate::align::points::{self, Pair};
 use crate::align::{AlignError, Similarity};
 
-/// The start.
+/// Initial values.
 #[derive(Clone, Debug)]
 pub(super) struct Start {
     pub(super) world_from_scene: Similarity,
-    /// In the order of the capture's. [world]
+    /// Tags in the order of the capture. [world]
     pub(super) tags: Vec<TagPlace>,
 }
 
-/// Finds it, and what is known by it.
+/// Computes the initial values, and which quantities the measurements determine.
 pub(super) fn start(capture: &Capture) -> Result<(Start, Known), AdjustError> {
     check(capture)?;
     let tags: Vec<Option<[DVec3; 4]>> =
@@ -38,7 +38,7 @@ pub(super) fn start(capture: &Capture) -> Result<(Start, Known), AdjustError> {
     Ok((Start { world_from_scene, tags }, known))
 }
 
-/// Returns where images alone have a tag's corners; `None` if their rays do not meet. [scene]
+/// Triangulates a tag's corners from images only; `None` if the rays do not meet. [scene]
 pub(super) fn triangulated(capture: &Capture, tag: usize) -> Option<[DVec3; 4]> {
     let mut rays: [Vec<Ray>; 4] = Default::default();
     for image in &capture.images {
@@ -58,7 +58,7 @@ pub(super) fn triangulated(capture: &Capture, tag: usize) -> Option<[DVec3; 4]> 
     let edges = (0..4).map(|k| corners[k].distance(corners[(k + 1) % 4]));
     let (least, greatest) =
         edges.fold((f64::MAX, 0.0f64), |(low, high), edge| (low.min(edge), high.max(edge)));
-    // Rays that meet by chance make no square.
+    // Rays that meet by chance do not form a square.
     (least > 0.5 * greatest).then_some(corners)
 }
 
@@ -103,7 +103,7 @@ fn similarity(
     Ok((Similarity { scale, rotation, translation_m: DVec3::ZERO }, known))
 }
 
-/// Returns the similarity by measured places of cameras, if there are enough.
+/// Returns the similarity transform from measured positions of cameras, if there are enough.
 fn by_places(capture: &Capture) -> Result<Option<Similarity>, AdjustError> {
     let placed = || capture.images.iter().filter_map(|image| Some((image, image.place?)));
     if placed().count() < 4 {
@@ -123,9 +123,9 @@ fn by_places(capture: &Capture) -> Result<Option<Similarity>, AdjustError> {
             .collect();
         let fit = match points::fit(&pairs, sigma_m) {
             Ok(fit) => fit,
-            // They say nothing: a walk along a line.
+            // A walk along a line does not determine it.
             Err(AlignError::OnOneLine | AlignError::TooFew { .. }) => return Ok(None),
-            Err(cause) => return Err(AdjustError::Contradictory { what: "tracked places", cause }),
+            Err(cause) => return Err(AdjustError::Contradictory { what: "cameras", cause }),
         };
         lever = capture.tracked_in_cam_m / fit.world_from_scene.scale;
         found = Some(fit.world_from_scene);
@@ -138,7 +138,7 @@ fn check(capture: &Capture) -> Result<(), AdjustError> {
     let count = capture.points.len();
     let is_number = |ok: bool, what| if ok { Ok(()) } else { Err(AdjustError::BadNumber(what)) };
     is_number(capture.points.iter().all(|p| p.is_finite()), "a point")?;
-    is_number(capture.tracked_in_cam_m.is_finite(), "the tracked point's place")?;
+    is_number(capture.tracked_in_cam_m.is_finite(), "the tracked point's position")?;
     let mut views = vec![0u32; count];
     for image in &capture.images {
         is_number(image.at_s.is_finite() && image.scene_from_cam.is_valid(), "an image's pose")?;
@@ -152,7 +152,7 @@ fn check(capture: &Capture) -> Result<(), AdjustError> {
         }
         if let Some(place) = image.place {
             let good = place.position_m.is_finite() && place.sigma_m > 0.0;
-            is_number(good && place.sigma_m.is_finite(), "a tracked place")?;
+            is_number(good && place.sigma_m.is_finite(), "a tracked position")?;
         }
         if let Some(up) = image.up {
             let good = up.direction.is_normalized() && up.sigma_rad > 0.0;
@@ -162,7 +162,7 @@ fn check(capture: &Capture) -> Result<(), AdjustError> {
     for tag in &capture.tags {
         let corners = tag.corners_m.iter().flatten().all(|corner| corner.is_finite());
         let good = corners && tag.size_m > 0.0 && tag.size_m.is_finite();
-        is_number(good, "a tag's size or place")?;
+        is_number(good, "a tag's size or position")?;
     }
     let points = views.iter().filter(|&&views| views > 1).count();
     let images = capture.images.len();
@@ -172,9 +172,9 @@ fn check(capture: &Capture) -> Result<(), AdjustError> {
     Ok(())
 }
 
-/// Before the adjustment, a pose is off by about this in a room. [m]
+/// Position error of a pose before the adjustment, in a room. [m]
 const START_SIGMA_M: f64 = 0.02;
-/// And turned by about this. [rad]
+/// Rotation error of a pose before the adjustment. [rad]
 const START_RAD: f64 = 0.02;
-/// The lever of the tracked point needs the scale, and the other way round.
+/// The offset of the tracked point needs the scale, and the other way round.
 const LEVER_ROUNDS: usize = 3;

@@ -1,4 +1,4 @@
-//! Everything that is found, and how far sightings are from it.
+//! All unknowns, and the residuals of sightings.
 
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
@@ -12,27 +12,27 @@ use super::start::Start;
 #[derive(Clone, Debug)]
 pub(super) struct State {
     pub(super) lens: Intrinsics,
-    /// World from camera.
+    /// Poses, world from camera.
     pub(super) cameras: Vec<Pose<World, Cam>>,
     pub(super) points: Vec<DVec3>,
     pub(super) rolling: Rolling,
     pub(super) tags: Vec<TagPlace>,
-    /// How far inside a tag its corners are found: white bleeds into black, in lenses and in sensors. [px]
+    /// Distance by which corners are detected inside tags, because white bleeds into black in lenses and sensors. [px]
     pub(super) inset_px: f64,
-    /// The principal point that it began with. [px]
+    /// Initial principal point. [px]
     pub(super) middle_px: DVec2,
-    /// Slopes beyond this are not seen.
+    /// Maximum visible slope.
     pub(super) reach: f64,
 }
 
-/// Where a tag is.
+/// Position of a tag.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum TagPlace {
-    /// Not known: its sightings do not count.
+    /// Unknown; its sightings are ignored.
     Nowhere,
-    /// Measured, and held to.
+    /// Measured corners, constant.
     Given([DVec3; 4]),
-    /// To be found: world from tag.
+    /// Estimated position and rotation, world from tag.
     Found(DVec3, DQuat),
 }
 
@@ -56,7 +56,7 @@ impl State {
         }
     }
 
-    /// Returns a tag's corners; `None` if it is nowhere. [m, world]
+    /// Returns a tag's corners; `None` if its position is unknown. [m, world]
     pub(super) fn corners_m(&self, capture: &Capture, tag: usize) -> Option<[DVec3; 4]> {
         match self.tags[tag] {
             TagPlace::Nowhere => None,
@@ -65,8 +65,8 @@ impl State {
         }
     }
 
-    /// Returns where a point of the world appears in an image, and its place in the camera when the row of `seen_px` is
-    /// exposed.
+    /// Projects a point of the world into an image. Returns its pixel, and its position in the camera frame when the
+    /// row of `seen_px` is exposed.
     pub(super) fn see(
         &self,
         camera: usize,
@@ -77,27 +77,27 @@ impl State {
         Some((project(&self.lens, self.reach, seen.p_cam)?, seen))
     }
 
-    /// Returns how far the principal point has come from where it began.
+    /// Returns the change of the principal point.
     pub(super) fn off_middle_px(&self) -> DVec2 {
         DVec2::new(self.lens.cx_px, self.lens.cy_px) - self.middle_px
     }
 
-    /// Returns one sigma of that: phones' are off the middle by up to a hundredth of the image.
+    /// Returns the prior standard deviation of that change: phones deviate from the centre by up to 1 % of the image.
     pub(super) fn middle_sigma_px(&self) -> f64 {
         0.01 * f64::from(self.lens.width_px)
     }
 
-    /// Returns a camera's pose when the row of a pixel is exposed.
+    /// Returns a camera's pose at the exposure of a pixel's row.
     pub(super) fn pose_at(&self, camera: usize, seen_px: DVec2) -> Pose<World, Cam> {
         self.rolling.row(camera, seen_px).pose(&self.cameras[camera])
     }
 
-    /// Returns how far a point is from where an image saw it; `None` where it cannot be seen. [px]
+    /// Returns the reprojection error of a point; `None` if the point is not visible. [px]
     pub(super) fn off_px(&self, camera: usize, p_world: DVec3, pixel: DVec2) -> Option<DVec2> {
         Some(self.see(camera, p_world, pixel)?.0.pixel - pixel)
     }
 
-    /// Returns how far a tag's corners are from where an image saw them, root mean square. [px]
+    /// Returns the RMS reprojection error of a tag's corners. [px]
     pub(super) fn tag_off_px(
         &self,
         camera: usize,
@@ -114,14 +114,13 @@ impl State {
     }
 }
 
-/// Returns the directions from a tag's corners to its middle, as they were found.
+/// Returns the directions from a tag's detected corners to their centre.
 pub(super) fn inwards(seen: &TagSighting) -> [DVec2; 4] {
     let middle = seen.corners_px.iter().sum::<DVec2>() / 4.0;
     seen.corners_px.map(|corner| (middle - corner).normalize_or_zero())
 }
 
-/// Returns the greatest slope that an image's corner has, with a margin for a lens that is still found; at most the
-/// lens's own.
+/// Returns the slope of the image's farthest corner, with a margin for a lens that is being estimated.
 fn reach(lens: &Intrinsics) -> f64 {
     let far = DVec2::new(
         lens.cx_px.max(f64::from(lens.width_px) - lens.cx_px) / lens.fx_px,

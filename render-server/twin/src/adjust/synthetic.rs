@@ -1,5 +1,4 @@
-//! A hall that nobody rendered: points and tags on its walls, a camera that walks a loop, and what structure from motion
-//! would make of it.
+//! A synthetic hall: points and tags on its walls, a camera that walks a loop, and the result of structure from motion.
 
 use std::f64::consts::TAU;
 
@@ -10,7 +9,7 @@ use super::{Capture, Image, Sighting, Tag, TagSighting};
 use crate::align::Similarity;
 use crate::random::Random;
 
-/// The truth and the capture.
+/// True poses and the capture.
 #[derive(Clone, Debug)]
 pub(crate) struct Hall {
     pub(crate) poses: Vec<Pose<World, Cam>>,
@@ -18,26 +17,26 @@ pub(crate) struct Hall {
     pub(crate) capture: Capture,
 }
 
-/// Half the hall's sides. [m]
+/// Half the extents of the hall. [m]
 const HALF: DVec3 = DVec3::new(5.0, 3.0, 1.6);
 const EDGE_M: f64 = 0.3;
 const IMAGE_S: f64 = 0.5;
 const STEP_HZ: f64 = 1.8;
 
-/// Returns a hall; `noise_px` is that of sightings.
+/// Returns a hall. `noise_px` is the noise of the sightings.
 pub(crate) fn hall(seed: u64, images: usize, points: usize, noise_px: f64) -> Hall {
     filmed(seed, images, points, noise_px, Shutter { readout_s: 0.0, hand_rad: 0.0 })
 }
 
-/// How images of a hall are exposed, row after row.
+/// Shutter of a hall's camera.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Shutter {
     pub(crate) readout_s: f64,
-    /// How far the hand nods and rolls at each step, faster than images show.
+    /// Pitch and roll of the hand at each step, faster than the image rate.
     pub(crate) hand_rad: f64,
 }
 
-/// Returns a hall that a rolling shutter has filmed, two images a second.
+/// Returns a hall filmed with a rolling shutter, two images per second.
 pub(crate) fn filmed(
     seed: u64,
     images: usize,
@@ -55,7 +54,7 @@ pub(crate) fn filmed(
         let at_s = IMAGE_S * image as f64 + after_s;
         let around = TAU * at_s / (IMAGE_S * images as f64);
         let at_m = DVec3::new(1.8 * around.cos(), 0.9 * around.sin(), 0.1 * (5.0 * around).sin());
-        // Outwards, and a little ahead; x right, y down, z forward.
+        // Outwards and a little ahead; x right, y down, z forward.
         let yaw = around + 0.3 + wander[image];
         let ahead = DVec3::new(yaw.cos(), yaw.sin(), 0.1 * (3.0 * around).cos()).normalize();
         let right = ahead.cross(DVec3::Z).normalize();
@@ -65,7 +64,7 @@ pub(crate) fn filmed(
         Pose::<World, Cam>::new(at_m, (DQuat::from_mat3(&axes) * hand).normalize())
     };
     let poses: Vec<Pose<World, Cam>> = (0..images).map(|image| pose_at(image, 0.0)).collect();
-    // The row that sees a point is that where it appears.
+    // The row that exposes a point depends on the point's position in the image: iterate.
     let see = |image: usize, p: DVec3| {
         let mut pixel = see(&lens, &poses[image], p)?;
         for _ in 0..if shutter.readout_s == 0.0 { 0 } else { 5 } {
@@ -88,7 +87,7 @@ pub(crate) fn filmed(
             let around = TAU * (f64::from(tag) + 0.3) / 12.0;
             let out = DVec3::new(around.cos(), around.sin(), 0.0);
             let reach = (HALF.x / out.x.abs()).min(HALF.y / out.y.abs());
-            // Faces inwards.
+            // Tags face inwards.
             let (x, y) = (out.cross(DVec3::Z), DVec3::Z);
             let middle = out * (reach - 0.1) + DVec3::Z * (0.5 * (3.0 * around).sin());
             [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
@@ -154,7 +153,7 @@ fn see(lens: &Intrinsics, pose: &Pose<World, Cam>, p: DVec3) -> Option<DVec2> {
 }
 
 impl Hall {
-    /// Returns it as structure from motion leaves it: in a frame of its own, everything a little off, a wrong focal
+    /// Returns the hall as structure from motion does: in an arbitrary frame, with small errors and a wrong focal
     /// length.
     pub(crate) fn found(mut self, seed: u64, off_m: f64) -> Self {
         let mut random = Random::new(seed);

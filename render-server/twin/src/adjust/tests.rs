@@ -1,4 +1,4 @@
-//! A synthetic hall: what is exact is found exactly, and bounds hold for what is not.
+//! Adjustment of a synthetic hall: exact input gives exact results, and the bounds hold for noisy input.
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Distortion, Pose};
@@ -11,7 +11,7 @@ use super::synthetic::{Hall, Shutter, filmed, hall};
 use super::*;
 use crate::align::points::{self, Pair};
 
-/// Returns the scale of the adjusted walk less 1, its tilt [rad], and how far cameras are off, root mean square [m].
+/// Returns the scale error of the adjusted walk, its tilt [rad], and the RMS position error of the cameras [m].
 fn errors(hall: &Hall, adjusted: &Adjusted) -> (f64, f64, f64) {
     let pairs: Vec<Pair> = adjusted
         .world_from_cam
@@ -21,7 +21,7 @@ fn errors(hall: &Hall, adjusted: &Adjusted) -> (f64, f64, f64) {
         .collect();
     let to = points::fit(&pairs, 1e3).unwrap().world_from_scene;
     let off2: f64 = pairs.iter().map(|pair| pair.scene.distance_squared(pair.world_m)).sum();
-    // How cameras are turned on the whole: their places, on a walk of a few metres, tell it worse.
+    // Mean rotation of the cameras: on a walk of a few metres, their positions determine it less accurately.
     let turns = adjusted.world_from_cam.iter().zip(&hall.poses).map(|(found, truth)| {
         let turn = found.rotation * truth.rotation.conjugate();
         (if turn.w < 0.0 { -turn } else { turn }).to_scaled_axis()
@@ -31,7 +31,7 @@ fn errors(hall: &Hall, adjusted: &Adjusted) -> (f64, f64, f64) {
 }
 
 #[test]
-fn exact_sightings_lead_back_to_the_truth() {
+fn exact_sightings_give_exact_results() {
     let hall = hall(1, 24, 2500, 0.0).found(2, 0.02);
     let adjusted = adjust(&hall.capture, Options::default()).unwrap();
     let (scale, tilt, off_m) = errors(&hall, &adjusted);
@@ -61,13 +61,13 @@ fn bounds_hold_under_noise() {
         assert!((0.5..1.1).contains(&adjusted.points_rms_px), "{}", adjusted.points_rms_px);
     }
     assert!(outside <= 1, "{outside} of 12 beyond three sigmas");
-    // Not bounds that hold because they say nothing.
+    // The bounds must not hold only because they are far too large.
     assert!(sigmas < 50.0 * scales, "sigma^2 {sigmas} for error^2 {scales}");
 }
 
-/// White that bleeds into black makes every edge shorter: distances between tags tell by how much.
+/// White that bleeds into black shortens every edge of a tag; distances between tags determine by how much.
 #[test]
-fn corners_that_are_found_inside_do_not_shrink_the_hall() {
+fn inset_corners_do_not_bias_the_scale() {
     let mut hall = hall(13, 24, 2500, 0.2).found(14, 0.01);
     for seen in hall.capture.images.iter_mut().flat_map(|image| &mut image.tags) {
         let middle = seen.corners_px.iter().sum::<glam::DVec2>() / 4.0;
@@ -83,7 +83,7 @@ fn corners_that_are_found_inside_do_not_shrink_the_hall() {
 }
 
 #[test]
-fn sizes_alone_give_metres_but_no_vertical() {
+fn tag_sizes_determine_scale_but_not_the_vertical() {
     let mut hall = hall(3, 24, 2500, 0.3).found(4, 0.01);
     hall.capture.tags.iter_mut().for_each(|tag| tag.corners_m = None);
     let adjusted = adjust(&hall.capture, Options::default()).unwrap();
@@ -95,7 +95,7 @@ fn sizes_alone_give_metres_but_no_vertical() {
 }
 
 #[test]
-fn a_vertical_and_tracked_places_are_held_to() {
+fn uses_measured_vertical_and_positions() {
     let mut upright = hall(3, 24, 2500, 0.3).found(4, 0.01);
     upright.capture.tags.iter_mut().for_each(|tag| tag.corners_m = None);
     for (image, pose) in upright.capture.images.iter_mut().zip(&upright.poses) {
@@ -115,7 +115,7 @@ fn a_vertical_and_tracked_places_are_held_to() {
     {
         image.tags.clear();
         let mut position_m = pose.transform_point(lever_m);
-        // One that the motion capture lost.
+        // An outlier of the motion capture.
         position_m.x += if number == 7 { 0.5 } else { 0.0 };
         image.place = Some(Place { position_m, sigma_m: 0.002 });
     }
@@ -126,7 +126,7 @@ fn a_vertical_and_tracked_places_are_held_to() {
 }
 
 #[test]
-fn without_anything_it_has_no_metres() {
+fn has_no_metric_scale_without_measurements() {
     let mut hall = hall(5, 24, 2500, 0.2).found(6, 0.01);
     hall.capture.tags.clear();
     hall.capture.images.iter_mut().for_each(|image| image.tags.clear());
@@ -136,15 +136,15 @@ fn without_anything_it_has_no_metres() {
     assert!(adjusted.points_rms_px < 0.4, "{}", adjusted.points_rms_px);
 }
 
-/// A mismatch may put a point a millimetre before a camera: that it pulls hard on this one tells nothing of the others,
-/// and takes nothing from what is known.
+/// A mismatch may put a point a millimetre in front of a camera. Its strong influence on that camera must not spoil the
+/// other unknowns.
 #[test]
-fn a_point_before_the_nose_of_a_camera_leaves_all_determined() {
+fn point_close_to_a_camera_keeps_the_problem_determined() {
     for before_m in [1e-2, 1e-4, 1e-6, 1e-9] {
         let mut hall = hall(5, 24, 1000, 0.2);
         hall.capture.tags.clear();
         hall.capture.images.iter_mut().for_each(|image| image.tags.clear());
-        // One camera stands where another looks.
+        // Put a camera where another looks.
         let far = hall.poses[3];
         let ahead = far.rotation * DVec3::Z;
         let near = Pose::new(far.translation_m + ahead, far.rotation);
@@ -170,10 +170,9 @@ fn a_point_before_the_nose_of_a_camera_leaves_all_determined() {
     }
 }
 
-/// Rows that follow each other over a fiftieth of a second, held by a hand that nods: what no shutter that opens at once
-/// explains.
+/// Rows exposed over a fiftieth of a second by a hand that pitches: a global shutter cannot explain the images.
 #[test]
-fn a_rolling_shutter_is_found_and_moves_nothing() {
+fn estimates_a_rolling_shutter_without_position_errors() {
     let shutter = Shutter { readout_s: 0.022, hand_rad: 0.015 };
     for seed in [21, 22] {
         let hall = filmed(seed, 36, 2500, 0.3, shutter).found(seed + 10, 0.01);
@@ -204,7 +203,7 @@ fn a_rolling_shutter_is_found_and_moves_nothing() {
 }
 
 #[test]
-fn a_shutter_that_opens_at_once_is_found_to_do_so() {
+fn estimates_zero_readout_of_a_global_shutter() {
     for seed in 0..3 {
         let shutter = Shutter { readout_s: 0.0, hand_rad: 0.02 };
         let hall = filmed(seed, 36, 2500, 0.5, shutter).found(seed + 30, 0.01);
@@ -223,7 +222,7 @@ fn a_shutter_that_opens_at_once_is_found_to_do_so() {
 }
 
 #[test]
-fn the_same_on_any_number_of_threads() {
+fn result_does_not_depend_on_the_number_of_threads() {
     let hall = hall(7, 20, 600, 0.5).found(8, 0.01);
     let with = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -233,7 +232,7 @@ fn the_same_on_any_number_of_threads() {
 }
 
 #[test]
-fn what_cannot_be_meant_is_refused() {
+fn rejects_invalid_captures() {
     let good = hall(9, 20, 600, 0.2).found(10, 0.01).capture;
     let refused = |change: &dyn Fn(&mut Capture)| {
         let mut capture = good.clone();
@@ -256,7 +255,7 @@ fn what_cannot_be_meant_is_refused() {
 }
 
 #[test]
-fn derivatives_by_poses_are_the_slopes_of_the_projection() {
+fn pose_derivatives_match_finite_differences() {
     let hall = hall(11, 20, 300, 0.0);
     let (begin, _) = start(&hall.capture).unwrap();
     let mut state = State::new(&hall.capture, &begin);
@@ -308,9 +307,9 @@ fn derivatives_by_poses_are_the_slopes_of_the_projection() {
     }
 }
 
-/// The gradient of tags, places and verticals by every unknown, against differences of what they cost.
+/// Compares the gradient of tags, positions and verticals by every unknown with differences of the cost.
 #[test]
-fn the_gradient_is_the_slope_of_the_cost() {
+fn gradient_matches_differences_of_the_cost() {
     let mut hall = hall(12, 16, 300, 2.0);
     hall.capture.tags.iter_mut().step_by(2).for_each(|tag| tag.corners_m = None);
     hall.capture.tracked_in_cam_m = DVec3::new(0.1, 0.05, -0.2);
@@ -324,7 +323,7 @@ fn the_gradient_is_the_slope_of_the_cost() {
         image.up = Some(Up { direction, sigma_rad: 0.05 });
     }
     let (begin, _) = start(&hall.capture).unwrap();
-    // Points would follow: without them, nothing is eliminated.
+    // Remove the sightings of points, so that no points are eliminated.
     hall.capture.images.iter_mut().for_each(|image| image.seen.clear());
     let mut state = State::new(&hall.capture, &begin);
     state.inset_px = 0.2;

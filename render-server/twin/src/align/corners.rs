@@ -1,4 +1,4 @@
-//! Corners of printed tags, seen by cameras whose poses in the scene are known: where the scene has each.
+//! Triangulation of the corners of printed tags, from cameras with known poses in the scene.
 
 use glam::{DMat3, DVec3};
 
@@ -7,9 +7,9 @@ use super::eigen::symmetric;
 /// A line of sight to a corner.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
-    /// The camera. [scene]
+    /// Camera position. [scene]
     pub origin: DVec3,
-    /// Towards the corner, of unit length. [scene]
+    /// Unit direction to the corner. [scene]
     pub direction: DVec3,
 }
 
@@ -20,24 +20,24 @@ impl Ray {
     }
 }
 
-/// A point that several rays meet in.
+/// A point triangulated from several rays.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Corner {
-    /// Where. [scene]
+    /// Position. [scene]
     pub position: DVec3,
-    /// How far rays pass by it, root mean square. [rad]
+    /// RMS angle between the rays and the point. [rad]
     pub rms_rad: f64,
-    /// Rays that meet there.
+    /// Number of rays used.
     pub used: usize,
 }
 
-/// Returns where rays meet; `None` where fewer than two do, or all look along one line. Rays that pass by where the
-/// others meet are left out.
+/// Triangulates a point. Rays that miss the intersection of the others are rejected. Returns `None` if fewer than two
+/// remain, fewer than half of them, or if all are nearly parallel.
 pub fn meet(rays: &[Ray]) -> Option<Corner> {
     meet_within(rays, PASSES_BY_RAD)
 }
 
-/// As [`meet`], by rays that are known to an angle. [rad]
+/// Triangulates like [`meet`], with a given accuracy of the rays. [rad]
 pub fn meet_within(rays: &[Ray], passes_by_rad: f64) -> Option<Corner> {
     let mut used = rays.to_vec();
     loop {
@@ -49,7 +49,7 @@ pub fn meet_within(rays: &[Ray], passes_by_rad: f64) -> Option<Corner> {
             let rms_rad = (squares / used.len() as f64).sqrt();
             return Some(Corner { position, rms_rad, used: used.len() });
         }
-        // One that is far off pulls the rest along: the worst goes, then all are looked at again.
+        // A bad ray displaces the solution for all: remove only the worst, then solve again.
         used.swap_remove(index);
         if used.len() < 2 || used.len() * 2 < rays.len() {
             return None;
@@ -57,7 +57,7 @@ pub fn meet_within(rays: &[Ray], passes_by_rad: f64) -> Option<Corner> {
     }
 }
 
-/// Returns the point with the least squares of angles.
+/// Returns the point with the least sum of squared angles.
 fn nearest(rays: &[Ray]) -> Option<DVec3> {
     let mut weights = vec![1.0; rays.len()];
     let mut position = DVec3::ZERO;
@@ -77,7 +77,7 @@ fn nearest(rays: &[Ray]) -> Option<DVec3> {
         }
         position = across.inverse() * sum;
         for (weight, ray) in weights.iter_mut().zip(rays) {
-            // A distance from the ray is an angle by how far it is.
+            // The angle is the distance from the ray, divided by the distance from the camera.
             *weight = 1.0 / position.distance_squared(ray.origin).max(f64::MIN_POSITIVE);
         }
     }
@@ -85,9 +85,9 @@ fn nearest(rays: &[Ray]) -> Option<DVec3> {
     rays.iter().all(is_ahead).then_some(position)
 }
 
-/// Three pixels of a lens with 600 px: a corner that was found is within one.
+/// Maximum angle of a used ray: three pixels at a focal length of 600 px; detected corners are within one pixel.
 const PASSES_BY_RAD: f64 = 0.005;
-/// Rays less than some 2 degrees apart do not say how far they meet: the square of half of that.
+/// Minimum eigenvalue ratio: rays within about 2 degrees do not determine a distance (square of half of that).
 const PARALLEL: f64 = 3e-4;
 const ROUNDS: usize = 5;
 
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn rays_meet_and_a_wrong_one_is_left_out() {
+    fn triangulates_and_rejects_a_wrong_ray() {
         let mut random = crate::random::Random::new(3);
         let p = DVec3::new(0.4, -0.2, 0.1);
         let around = |k: i32| {
@@ -118,12 +118,12 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_meet_is_nowhere() {
+    fn rejects_rays_that_do_not_meet() {
         let p = DVec3::new(0.0, 5.0, 0.0);
         let side_by_side = [ray(DVec3::ZERO, p), ray(DVec3::new(0.01, 0.0, 0.0), p)];
         assert_eq!(meet(&side_by_side), None);
         assert_eq!(meet(&side_by_side[..1]), None);
-        // They cross behind both.
+        // Two rays that intersect behind both cameras.
         let behind =
             [DVec3::X, -DVec3::X].map(|origin| Ray { origin, direction: (origin - p).normalize() });
         assert_eq!(meet(&behind), None);

@@ -1,7 +1,7 @@
-//! Eigenvalues and eigenvectors of small symmetric matrices, by Jacobi's rotations (Golub and Van Loan, Matrix
+//! Eigenvalues and eigenvectors of small symmetric matrices, by Jacobi rotations (Golub and Van Loan, Matrix
 //! Computations, 8.5).
 
-/// Returns eigenvalues, ascending, each with its unit eigenvector.
+/// Returns the eigenvalues in ascending order, each with its unit eigenvector.
 pub(super) fn symmetric<const N: usize>(mut a: [[f64; N]; N]) -> [(f64, [f64; N]); N] {
     let mut vectors = [[0.0; N]; N];
     for (index, row) in vectors.iter_mut().enumerate() {
@@ -35,7 +35,7 @@ pub(super) fn symmetric<const N: usize>(mut a: [[f64; N]; N]) -> [(f64, [f64; N]
     pairs
 }
 
-/// Converges quadratically: 4 x 4 matrices are done after five.
+/// Jacobi sweeps. Convergence is quadratic: 4 x 4 matrices need five.
 const SWEEPS: usize = 12;
 
 #[cfg(test)]
@@ -45,7 +45,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn eigenvectors_are_stretched_by_their_eigenvalues(
+        fn eigenvectors_satisfy_the_definition(
             values in prop::array::uniform10(-10.0..10.0f64)
         ) {
             let mut matrix = [[0.0; 4]; 4];

@@ -1,31 +1,31 @@
-//! A scene's place by what a person can point at: three or more points of the floor, and a length that was measured.
+//! Alignment by manually selected points: three or more points of the floor, and a measured length.
 
 use glam::{DQuat, DVec3};
 
 use super::eigen::symmetric;
 use super::{AlignError, Fit, Similarity};
 
-/// What a person has pointed at, in the scene's frame.
+/// Points selected by a person, in the scene's frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Floor {
-    /// At least three points of the floor; the first becomes the world's origin, the second lies on its x axis.
+    /// At least three points of the floor. The first becomes the world's origin; the second lies on its x axis.
     pub points: Vec<DVec3>,
-    /// A point that is above the floor, such as the middle of the cameras.
+    /// A point above the floor, for example the centroid of the cameras.
     pub above: DVec3,
-    /// The ends of a known length.
+    /// End points of the known length.
     pub length: [DVec3; 2],
-    /// That length. [m]
+    /// Known length. [m]
     pub length_m: f64,
-    /// How well it was measured, one sigma. [m]
+    /// Standard deviation of the known length. [m]
     pub length_sigma_m: f64,
-    /// How well a person points, one sigma. [m]
+    /// Standard deviation of a selected point. [m]
     pub click_sigma_m: f64,
 }
 
-/// Finds the scene's place: the floor at z = 0, the first point at the origin.
+/// Aligns the scene: floor at z = 0, first point at the origin.
 ///
 /// # Errors
-/// Too few points, on one line, a length of nothing, or no side that is above.
+/// Too few points, points on one line, a zero length, or an ambiguous upward direction.
 pub fn fit(floor: &Floor) -> Result<Fit, AlignError> {
     let Floor { points, above, length, length_m, length_sigma_m, click_sigma_m } = floor;
     if points.len() < NEEDED {
@@ -68,7 +68,7 @@ pub fn fit(floor: &Floor) -> Result<Fit, AlignError> {
         return Err(AlignError::FloorAmbiguous);
     }
     let up = normal * height.signum();
-    // Level, then turned until the second point lies on the x axis.
+    // Level the scene, then rotate it until the second point lies on the x axis.
     let level = DQuat::from_rotation_arc(up, DVec3::Z);
     let ahead = level * (points[1] - points[0]);
     let rotation = DQuat::from_rotation_z(-ahead.y.atan2(ahead.x)) * level;
@@ -79,7 +79,7 @@ pub fn fit(floor: &Floor) -> Result<Fit, AlignError> {
 
     let off_m: Vec<f64> = points.iter().map(|p| off(*p).abs() * scale).collect();
     let squares: f64 = off_m.iter().map(|m| m * m).sum();
-    // A plane has three numbers: of three points it says nothing about the clicks.
+    // A plane has three parameters: three points leave no residual to estimate the accuracy from.
     let found_m = if points.len() > NEEDED { (squares / (count - 3.0)).sqrt() } else { 0.0 };
     let click_m = found_m.max(*click_sigma_m);
     let reach_m = scale * ahead.truncate().length();
@@ -90,7 +90,7 @@ pub fn fit(floor: &Floor) -> Result<Fit, AlignError> {
         used: points.len(),
         left_out: 0,
         scale_sigma: (length_sigma_m.powi(2) + 2.0 * click_m.powi(2)).sqrt() / length_m,
-        // About the longer axis of the points the shorter one holds it.
+        // The points' shorter extent determines the tilt about their longer axis.
         tilt_sigma_rad: click_m / (scale * second.sqrt()),
         yaw_sigma_rad: std::f64::consts::SQRT_2 * click_m / reach_m.max(click_m),
         place_sigma_m: click_m,
@@ -98,11 +98,11 @@ pub fn fit(floor: &Floor) -> Result<Fit, AlignError> {
     })
 }
 
-/// Three points make a floor.
+/// Minimum number of floor points.
 const NEEDED: usize = 3;
-/// As in [`super::points`].
+/// Limit of [`super::points`].
 const LINE_SHARE: f64 = 0.02;
-/// What is above the floor is at least this high. [m]
+/// Minimum height of `above` over the floor. [m]
 const ABOVE_M: f64 = 0.05;
 
 #[cfg(test)]
@@ -129,7 +129,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn exact_clicks_give_the_exact_place(truth in similarity()) {
+        fn exact_clicks_give_the_exact_alignment(truth in similarity()) {
             let fit = fit(&room(&truth)).unwrap();
             for p_m in [DVec3::new(3.0, 2.0, 1.0), DVec3::new(-1.0, 0.5, 2.5)] {
                 let found_m = fit.world_from_scene.transform_point(back(&truth, p_m));
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn bounds_hold_for_clicks_that_are_off() {
+    fn bounds_hold_for_inaccurate_clicks() {
         let mut random = crate::random::Random::new(9);
         let truth = Similarity {
             scale: 0.17,
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_meant_is_refused() {
+    fn rejects_invalid_input() {
         let still =
             Similarity { scale: 1.0, rotation: DQuat::IDENTITY, translation_m: DVec3::ZERO };
         let good = room(&still);

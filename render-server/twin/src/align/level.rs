@@ -1,7 +1,8 @@
-//! The floor of a capture, found by its own points: which way is up where nothing measured tells it.
+//! Finds the floor of a capture in its own points, to level a scene without measurements.
 //!
-//! People hold a camera about level: the mean of what is up in all images is up within some degrees. Of the planes near
-//! level, below the cameras, the one with most points is the floor; it is level better than the hand was.
+//! People hold a camera about level: the mean of the images' upward directions is accurate to some degrees. Of all
+//! planes near level and below the cameras, the one with most points is the floor. It is more accurate than the
+//! camera's attitude.
 
 use glam::{DMat3, DVec3};
 
@@ -11,28 +12,28 @@ use crate::random::Random;
 /// A floor, in the frame of the scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Level {
-    /// Away from the floor, of unit length. [scene]
+    /// Unit normal, upwards. [scene]
     pub up: DVec3,
-    /// How far the floor lies along `up`: of its points `up.dot(p)`. [units of the scene]
+    /// Height of the floor along `up`: `up.dot(p)` of its points. [units of the scene]
     pub height: f64,
-    /// Points that it rests on.
+    /// Number of points on the floor.
     pub points: usize,
-    /// How far they are from it, root mean square. [units of the scene]
+    /// RMS distance of the points from the plane. [units of the scene]
     pub rms: f64,
-    /// How well `up` is known, the worse direction, one sigma; of the points, not of a floor that is not level. [rad]
+    /// Standard deviation of `up` in the worse direction, from the points; an inclined real floor is not included.
+    /// [rad]
     pub tilt_sigma_rad: f64,
 }
 
-/// A camera: where, and what is up in its image. [scene]
+/// Camera position and the upward direction of its image. [scene]
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Held {
-    /// Where it was.
     pub position: DVec3,
-    /// Up in the image, of unit length.
+    /// Upward direction of the image, of unit length.
     pub up: DVec3,
 }
 
-/// Finds the floor; `None` where too few points lie in any plane near level, below the cameras.
+/// Finds the floor. Returns `None` if too few points lie in any near-level plane below the cameras.
 pub fn find(points: &[DVec3], cameras: &[Held]) -> Option<Level> {
     let hint = cameras.iter().map(|held| held.up).sum::<DVec3>().try_normalize()?;
     let mut heights: Vec<f64> = cameras.iter().map(|held| hint.dot(held.position)).collect();
@@ -42,7 +43,7 @@ pub fn find(points: &[DVec3], cameras: &[Held]) -> Option<Level> {
         points.iter().copied().filter(|p| p.is_finite() && hint.dot(*p) < middle).collect();
     let mut depths: Vec<f64> = below.iter().map(|p| middle - hint.dot(*p)).collect();
     depths.sort_by(f64::total_cmp);
-    // Points far below the floor are wrong; most of those below the camera are on it or above.
+    // Points far below the floor are wrong; most points below the cameras are on the floor or above it.
     let deep = *depths.get(depths.len() * 9 / 10)?;
     let band = BAND * deep;
     let mut random = Random::stream(SEED, 0);
@@ -56,7 +57,7 @@ pub fn find(points: &[DVec3], cameras: &[Held]) -> Option<Level> {
         }
         let height = normal.dot(a);
         let count = below.iter().filter(|p| (normal.dot(**p) - height).abs() <= band).count();
-        // A table has points too, and a floor nothing below it.
+        // A table also has points, but only a floor has none below it.
         let under = below.iter().filter(|p| normal.dot(**p) < height - 3.0 * band).count();
         let score = count.saturating_sub(2 * under);
         if best.is_none_or(|(most, ..)| score > most) {
@@ -96,13 +97,14 @@ pub fn find(points: &[DVec3], cameras: &[Held]) -> Option<Level> {
     level.filter(|level| level.up.dot(hint) >= MOST_TILT_COS)
 }
 
-/// Of a floor's points from it, in heights of the camera above the lowest points: 3 cm of 1.5 m.
+/// Maximum distance of a floor's points from it, relative to the camera's height above the lowest points: 3 cm of 1.5
+/// m.
 const BAND: f64 = 0.02;
-/// cos(20 degrees): hands are not that far off on average.
+/// Maximum inclination, cos(20 degrees): on average, cameras are held more accurately.
 const MOST_TILT_COS: f64 = 0.939_692_620_785_908_4;
 const TRIES: usize = 500;
 const ROUNDS: usize = 5;
-/// Fewer may lie in a plane by chance.
+/// Minimum number of points: fewer may lie in a plane by chance.
 const LEAST_POINTS: usize = 30;
 const SEED: u64 = 7;
 
@@ -111,7 +113,8 @@ mod tests {
     use super::*;
     use glam::DQuat;
 
-    /// A hall of 10 x 6 m, 4 m high, whose frame is turned: points on floor and walls, a table, some below the floor.
+    /// Returns a hall of 10 x 6 m, 4 m high, in a rotated frame: points on floor and walls, a table, some below the
+    /// floor.
     fn hall(turn: DQuat, floor: usize) -> (Vec<DVec3>, Vec<Held>) {
         let mut random = Random::stream(3, 1);
         let mut within = |low: f64, high: f64| low + f64::from(random.unit()) * (high - low);
@@ -131,7 +134,7 @@ mod tests {
         }
         let held = (0..40).map(|_| Held {
             position: DVec3::new(within(1.0, 9.0), within(1.0, 5.0), within(1.35, 1.5)),
-            // The hand nods and rolls by some degrees, and looks down on average.
+            // The camera pitches and rolls by some degrees, and looks down on average.
             up: DVec3::new(within(-0.1, 0.25), within(-0.15, 0.15), 1.0).normalize(),
         });
         let held: Vec<Held> = held.collect();
@@ -141,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn the_floor_is_found_below_tables_and_beside_walls() {
+    fn finds_the_floor_despite_tables_and_walls() {
         for turn in
             [DQuat::IDENTITY, DQuat::from_xyzw(0.5, -0.5, 0.5, 0.5), DQuat::from_rotation_x(2.0)]
         {
@@ -155,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn no_floor_is_no_level() {
+    fn returns_none_without_a_floor() {
         let (points, cameras) = hall(DQuat::IDENTITY, 0);
         let walls: Vec<DVec3> = points.into_iter().filter(|p| p.x == 0.0).collect();
         assert_eq!(find(&walls, &cameras), None);

@@ -1,13 +1,13 @@
-//! Where a scene lies in the room, and how well that is known.
+//! Alignment of a scene with the room, and its accuracy.
 //!
 //! ```text
 //! floor    three points of the floor, one known length ------------------------------.
 //! corners  rays from posed images to printed tags -> points -.                        |
 //!                                                            +-> points (matched) -> Fit -> go or no-go
-//! track    the camera's places by motion capture (recording) '
+//! track    the camera's positions by motion capture (recording) '
 //! ```
-//! A scene's own units and axes are arbitrary. What comes out is the similarity that takes them to the `world` frame,
-//! with bounds on what matters to a vehicle: how far a wall may be from where the twin has it.
+//! A scene's own units and axes are arbitrary. The result is the similarity transform to the `world` frame, with bounds
+//! on the error that matters to a vehicle: the distance between a real wall and the twin's wall.
 
 pub mod corners;
 mod eigen;
@@ -22,52 +22,52 @@ mod tests_support;
 
 use glam::{DQuat, DVec3};
 
-/// Takes points of a scene to the world: `scale * (rotation * p) + translation_m`.
+/// Similarity transform from a scene to the world: `scale * (rotation * p) + translation_m`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Similarity {
     /// Metres per unit of the scene.
     pub scale: f64,
-    /// The scene's axes to the world's.
+    /// Rotation from the scene's axes to the world's.
     pub rotation: DQuat,
-    /// Where the scene's origin lies. [m, world]
+    /// Position of the scene's origin. [m, world]
     pub translation_m: DVec3,
 }
 
 impl Similarity {
-    /// Returns where a point of the scene lies. [m, world]
+    /// Transforms a point of the scene. [m, world]
     pub fn transform_point(&self, p_scene: DVec3) -> DVec3 {
         self.rotation * p_scene * self.scale + self.translation_m
     }
 }
 
-/// A scene's place, and how well it is known. Sigmas are one standard deviation.
+/// Alignment of a scene, and its accuracy. Sigmas are one standard deviation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fit {
-    /// Takes the scene to the world.
+    /// Transform from the scene to the world.
     pub world_from_scene: Similarity,
-    /// How far apart what should coincide is, root mean square. [m]
+    /// RMS residual of the matched pairs. [m]
     pub rms_m: f64,
-    /// The worst of it. [m]
+    /// Maximum residual. [m]
     pub worst_m: f64,
-    /// Pairs that were used.
+    /// Number of pairs used.
     pub used: usize,
-    /// Pairs that contradicted the rest, and were left out.
+    /// Number of rejected pairs, which contradict the rest.
     pub left_out: usize,
-    /// Of the scale, as a share of it.
+    /// Relative standard deviation of the scale.
     pub scale_sigma: f64,
-    /// Of the vertical: the worse direction. [rad]
+    /// Standard deviation of the vertical, in the worse direction. [rad]
     pub tilt_sigma_rad: f64,
-    /// Of the heading. [rad]
+    /// Standard deviation of the heading. [rad]
     pub yaw_sigma_rad: f64,
-    /// Of the place at the middle of what was matched, along each axis. [m]
+    /// Standard deviation of the position along each axis, at the centroid of the matched points. [m]
     pub place_sigma_m: f64,
-    /// That middle. [m, world]
+    /// Centroid of the matched points. [m, world]
     pub middle_m: DVec3,
 }
 
 impl Fit {
-    /// Returns how far what the scene shows at a place may be from where it really is: three sigmas of place, scale,
-    /// tilt and heading together. [m]
+    /// Returns the maximum alignment error at a position: three sigmas of position, scale, tilt and heading together.
+    /// [m]
     pub fn bound_m(&self, p_world: DVec3) -> f64 {
         let arm_m = p_world - self.middle_m;
         let level_m = arm_m.truncate().length();
@@ -78,7 +78,7 @@ impl Fit {
         3.0 * (place_m2 + scale_m.powi(2) + tilt_m.powi(2) + yaw_m.powi(2)).sqrt()
     }
 
-    /// Returns the worst of [`Self::bound_m`] over the corners of a box. [m]
+    /// Returns the maximum of [`Self::bound_m`] over the corners of a box. [m]
     pub fn bound_within_m(&self, min_m: DVec3, max_m: DVec3) -> f64 {
         let corner = |index: u32| {
             let pick = |bit: u32, low: f64, high: f64| if index & bit == 0 { low } else { high };
@@ -92,29 +92,31 @@ impl Fit {
     }
 }
 
-/// Why a place could not be found.
+/// Why a scene cannot be aligned.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum AlignError {
-    /// Fewer than needed.
+    /// Too few points.
     #[error("{given} points are too few; give at least {needed}")]
     TooFew {
-        /// So many came.
+        /// Number of given points.
         given: usize,
-        /// So many are needed.
+        /// Minimum number.
         needed: usize,
     },
-    /// All on one line, or in one place.
-    #[error("the points lie on one line, about which the scene may turn; give one well beside it")]
+    /// All points are on one line or at one place.
+    #[error(
+        "the points lie on one line, so rotation about it is undetermined; add a point well away from it"
+    )]
     OnOneLine,
-    /// A length of nothing.
+    /// The known length is zero in the scene.
     #[error("the two ends of the known length coincide in the scene; pick them farther apart")]
     NoLength,
-    /// Which side of the floor is up?
+    /// The upward side of the floor is ambiguous.
     #[error(
-        "what is known to be above the floor lies in it; pick floor points of the floor, or say which way is up"
+        "the point above the floor lies in the floor's plane; select points on the floor, or give the upward direction"
     )]
     FloorAmbiguous,
-    /// A number that is none, or a length that is not positive.
+    /// A value that is not finite, or a length that is not positive.
     #[error("{0} is not a finite number above zero")]
     BadNumber(&'static str),
     /// More pairs contradict each other than agree.
@@ -123,12 +125,12 @@ pub enum AlignError {
          move?"
     )]
     Contradictory {
-        /// So many do not fit.
+        /// Number of contradicting pairs.
         left_out: usize,
-        /// Of so many.
+        /// Number of all pairs.
         given: usize,
     },
-    /// Nothing in the motion shows where the tracked point is.
+    /// The motion does not determine the position of the tracked point.
     #[error(
         "the camera hardly moved: {0}; walk through the room, and turn the camera while you do"
     )]

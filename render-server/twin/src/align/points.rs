@@ -1,8 +1,8 @@
-//! A scene's place by points that are known in both frames.
+//! Alignment by points with known positions in both frames.
 //!
-//! The rotation is the unit quaternion that is the greatest eigenvector of a 4 x 4 matrix (B. Horn, "Closed-form
-//! solution of absolute orientation using unit quaternions", JOSA A 4(4), 1987); the scale is that with the least
-//! squares in the world (S. Umeyama, "Least-squares estimation of transformation parameters between two point
+//! The rotation is the unit quaternion that is the eigenvector of a 4 x 4 matrix with the largest eigenvalue (B. Horn,
+//! "Closed-form solution of absolute orientation using unit quaternions", JOSA A 4(4), 1987). The scale minimises the
+//! squared error in the world (S. Umeyama, "Least-squares estimation of transformation parameters between two point
 //! patterns", PAMI 13(4), 1991).
 
 use glam::{DMat3, DQuat, DVec3};
@@ -11,20 +11,20 @@ use super::eigen::symmetric;
 use super::{AlignError, Fit, Similarity};
 use crate::random::Random;
 
-/// One point in both frames.
+/// A point in both frames.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pair {
-    /// Where the scene has it.
+    /// Position in the scene.
     pub scene: DVec3,
-    /// Where it is. [m, world]
+    /// Position in the world. [m, world]
     pub world_m: DVec3,
 }
 
-/// Finds the scene's place by at least three pairs, each known to `sigma_m` in the world, as it is claimed; sigmas are
-/// by what is found, where that is worse. Pairs that contradict the others are left out.
+/// Aligns a scene by at least three pairs with a claimed accuracy of `sigma_m` in the world. Sigmas of the result use
+/// the actual residuals if those are larger. Pairs that contradict the others are rejected.
 ///
 /// # Errors
-/// Too few, on one line, not finite, or more that contradict than agree.
+/// Too few pairs, pairs on one line, values that are not finite, or more contradicting than agreeing pairs.
 pub fn fit(pairs: &[Pair], sigma_m: f64) -> Result<Fit, AlignError> {
     check(pairs, sigma_m)?;
     let mut similarity = closest(pairs)?;
@@ -38,7 +38,7 @@ pub fn fit(pairs: &[Pair], sigma_m: f64) -> Result<Fit, AlignError> {
         let is_good = |pair: &&Pair| distance_m(&similarity, pair) <= limit_m;
         let next: Vec<Pair> = pairs.iter().filter(is_good).copied().collect();
         let left_out = pairs.len() - next.len();
-        // Of five, one may be wrong: the other four still contradict it and agree with each other.
+        // Of five pairs, one may be wrong: the other four still agree with each other and contradict it.
         if next.len() * 2 <= pairs.len() || (left_out > 0 && pairs.len() < NEEDED_TO_DOUBT) {
             return Err(AlignError::Contradictory { left_out, given: pairs.len() });
         }
@@ -51,21 +51,21 @@ pub fn fit(pairs: &[Pair], sigma_m: f64) -> Result<Fit, AlignError> {
     Ok(describe(&similarity, &used, pairs.len() - used.len(), sigma_m))
 }
 
-/// Returns the sigma of an axis that the nearer half of the pairs shows. [m]
+/// Returns the standard deviation per axis, estimated from the better half of the pairs. [m]
 fn spread_m(similarity: &Similarity, pairs: &[Pair]) -> f64 {
     let mut off_m: Vec<f64> = pairs.iter().map(|pair| distance_m(similarity, pair)).collect();
     off_m.sort_by(f64::total_cmp);
-    // The median of the length of three normal numbers is 1.54.
+    // The median length of a vector of three standard normal numbers is 1.54.
     off_m[off_m.len() / 2] / 1.54
 }
 
-/// Returns the place that half of the pairs agree best with: the least median over places by three of them (P.
+/// Returns the alignment that half of the pairs fit best: the least median over alignments from three random pairs (P.
 /// Rousseeuw, "Least median of squares regression", JASA 79, 1984).
 fn most_agreed(pairs: &[Pair]) -> Option<Similarity> {
     let mut random = Random::new(pairs.len() as u64);
     let mut places = (0..TRIALS).filter_map(|_| {
         let three = std::array::from_fn::<_, 3, _>(|_| pairs[random.below(pairs.len())]);
-        // The same one twice is on one line.
+        // A pair drawn twice counts as on one line.
         closest(&three).ok()
     });
     let first = places.next()?;
@@ -76,7 +76,7 @@ fn most_agreed(pairs: &[Pair]) -> Option<Similarity> {
     Some(best.1)
 }
 
-/// As [`fit`], by all of the pairs: for searches.
+/// Aligns like [`fit`], without rejecting pairs: for searches.
 pub(super) fn fit_all(pairs: &[Pair], sigma_m: f64) -> Result<Fit, AlignError> {
     check(pairs, sigma_m)?;
     Ok(describe(&closest(pairs)?, pairs, 0, sigma_m))
@@ -96,10 +96,10 @@ fn distance_m(similarity: &Similarity, pair: &Pair) -> f64 {
     similarity.transform_point(pair.scene).distance(pair.world_m)
 }
 
-/// Returns the similarity with the least squares, by all of the pairs.
+/// Returns the least-squares similarity transform of all pairs.
 ///
 /// # Errors
-/// Too few, or on one line.
+/// Too few pairs, or pairs on one line.
 pub fn closest(pairs: &[Pair]) -> Result<Similarity, AlignError> {
     if pairs.len() < NEEDED {
         return Err(AlignError::TooFew { given: pairs.len(), needed: NEEDED });
@@ -109,7 +109,7 @@ pub fn closest(pairs: &[Pair]) -> Result<Similarity, AlignError> {
     let to = pairs.iter().map(|pair| pair.world_m).sum::<DVec3>() / count;
     check_spread(pairs.iter().map(|pair| pair.scene - from))?;
     check_spread(pairs.iter().map(|pair| pair.world_m - to))?;
-    // m.col(k) is the sum of scene times the world's k.
+    // m.col(k) is the sum of scene position times the world's component k.
     let mut m = DMat3::ZERO;
     let mut scene2 = 0.0;
     for pair in pairs {
@@ -131,7 +131,7 @@ pub fn closest(pairs: &[Pair]) -> Result<Similarity, AlignError> {
     Ok(Similarity { scale, rotation, translation_m: to - rotation * from * scale })
 }
 
-/// Refuses points about whose line the rest may turn.
+/// Rejects points on a line, about which the scene could rotate.
 fn check_spread(centred: impl Iterator<Item = DVec3>) -> Result<(), AlignError> {
     let mut scatter = [[0.0; 3]; 3];
     for p in centred {
@@ -150,10 +150,10 @@ fn describe(similarity: &Similarity, used: &[Pair], left_out: usize, sigma_m: f6
     let middle_m = used.iter().map(|pair| pair.world_m).sum::<DVec3>() / count;
     let off_m: Vec<f64> = used.iter().map(|pair| distance_m(similarity, pair)).collect();
     let squares: f64 = off_m.iter().map(|off_m| off_m * off_m).sum();
-    // Seven numbers were fitted.
+    // Seven parameters are fitted.
     let found_m = (squares / (3.0 * count - 7.0)).sqrt();
     let sigma_m = sigma_m.max(found_m);
-    // Of a small turn, by how it moves the points.
+    // Information about a small rotation, from how it moves the points.
     let mut information = DMat3::ZERO;
     let mut reach2 = 0.0;
     for pair in used {
@@ -179,16 +179,16 @@ fn describe(similarity: &Similarity, used: &[Pair], left_out: usize, sigma_m: f6
     }
 }
 
-/// Three points fix a similarity.
+/// A similarity transform needs three points.
 const NEEDED: usize = 3;
-/// Beyond so many sigmas, all axes together, a pair is not what it says: of good ones it leaves out one in 10,000.
+/// Maximum residual in sigmas, over all axes together: it rejects one in 10,000 good pairs.
 const OUTLIER_SIGMAS: f64 = 4.6;
 const ROUNDS: usize = 8;
-/// Fewer pairs do not show which of them is wrong.
+/// Minimum number of pairs to identify a wrong one.
 const NEEDED_TO_DOUBT: usize = 5;
-/// With a third of the pairs wrong, all of these places have a wrong one in them by a chance of 10^-46.
+/// With a third of the pairs wrong, the probability that every trial contains a wrong pair is 10^-46.
 const TRIALS: usize = 300;
-/// Points are on one line where the second extent is less than this share of the first.
+/// Points are on one line if the second extent is less than this fraction of the first.
 const LINE_SHARE: f64 = 0.02;
 
 #[cfg(test)]
@@ -204,7 +204,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn exact_points_give_the_exact_place(truth in similarity(), scene in spread(3..20)) {
+        fn exact_points_give_the_exact_alignment(truth in similarity(), scene in spread(3..20)) {
             prop_assume!(closest(&pairs(&truth, &scene)).is_ok());
             let fit = fit(&pairs(&truth, &scene), 1e-3).unwrap();
             for p in scene {
@@ -215,7 +215,7 @@ mod tests {
         }
 
         #[test]
-        fn a_pair_that_is_matched_wrongly_is_left_out(
+        fn rejects_a_wrong_pair(
             truth in similarity(), scene in spread(8..20), wrong in 0usize..8, off in 1.0..4.0f64
         ) {
             let mut pairs = pairs(&truth, &scene);
@@ -229,8 +229,8 @@ mod tests {
     const ROOMS: usize = 500;
 
     #[test]
-    fn sigmas_are_honest() {
-        // 500 rooms whose points are off by 1 cm: what is wrong, in sigmas, squared, is 1 on the mean.
+    fn sigmas_match_the_actual_errors() {
+        // 500 rooms with points off by 1 cm: the squared error in sigmas has a mean of 1.
         let (mut tilt2, mut scale2, mut yaw2, mut outside) = (0.0, 0.0, 0.0, 0);
         let mut random = Random::new(5);
         for _ in 0..ROOMS {
@@ -248,7 +248,7 @@ mod tests {
             let found = fit.world_from_scene;
             let turn = found.rotation * truth.rotation.conjugate();
             let turn = 2.0 * turn.xyz() * turn.w.signum();
-            // The worse of two directions: compare with both.
+            // The sigma is that of the worse of two directions: compare with both.
             tilt2 += 0.5 * (turn.x.powi(2) + turn.y.powi(2)) / fit.tilt_sigma_rad.powi(2);
             yaw2 += (turn.z / fit.yaw_sigma_rad).powi(2);
             scale2 += ((found.scale / truth.scale - 1.0) / fit.scale_sigma).powi(2);
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_known_is_refused() {
+    fn rejects_undetermined_alignments() {
         let line: Vec<DVec3> = (0..9).map(|k| DVec3::new(f64::from(k), 0.0, 0.0)).collect();
         let still =
             Similarity { scale: 1.0, rotation: DQuat::IDENTITY, translation_m: DVec3::ZERO };

@@ -1,10 +1,10 @@
-//! A motion capture's recording, as a file: CSV with a header (ours, EuRoC's), TUM, Motive's and Vicon's exports.
+//! Reads recordings of a motion capture: CSV with a header (ours, EuRoC's), TUM, exports of Motive and Vicon.
 //!
 //! ```text
-//! text -> header row: which columns, which units -> rows -> Tracked, ascending in time
+//! text -> header row: columns and units -> rows -> Tracked, ascending in time
 //! ```
-//! A row without a position is a moment in which the point was lost, and is left out. A row that is wrong is an error with its
-//! line: a track that is guessed at puts walls where none are.
+//! A row without a position means that the tracked point was lost; it is skipped. An invalid row is an error with its
+//! line: guessing would put walls in wrong places.
 
 use glam::DVec3;
 
@@ -13,37 +13,37 @@ use super::track::Tracked;
 /// Why a recording cannot be used.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RecordingError {
-    /// Nothing in it says what its columns are.
+    /// No row names the columns.
     #[error(
         "no row names its columns; give a CSV with a header such as t,x,y,z (seconds and metres), or TUM's 8 numbers a line: \
          stamp tx ty tz qx qy qz qw"
     )]
     NoHeader,
-    /// A header without a time.
+    /// The header has no time column.
     #[error("line {line}: the header names no time; call a column t [s], or stamp_ns")]
     NoTime {
-        /// Counted from 1.
+        /// Line number, from 1.
         line: usize,
     },
-    /// A row that is no pose.
+    /// Invalid row.
     #[error("line {line}: {what}")]
     Row {
-        /// Counted from 1.
+        /// Line number, from 1.
         line: usize,
-        /// What is wrong with it.
+        /// Fault.
         what: String,
     },
-    /// Frames counted, but not how many a second.
+    /// Frame numbers without a frame rate.
     #[error(
-        "frames are counted, but how many a second is said nowhere; export the frame rate along, or a column t"
+        "the recording has frame numbers but no frame rate; export the frame rate too, or a column t"
     )]
     NoRate,
-    /// Hardly a row.
-    #[error("{0} poses are no track; is the right object exported?")]
+    /// Too few poses.
+    #[error("{0} poses are too few for a track; is the right object exported?")]
     TooFew(usize),
 }
 
-/// Reads a recording's track: of several objects the first.
+/// Reads the track of a recording: of several objects, the first.
 ///
 /// # Errors
 /// [`RecordingError`], with the line.
@@ -68,7 +68,7 @@ pub fn parse(text: &str) -> Result<Vec<Tracked>, RecordingError> {
     Ok(found)
 }
 
-/// Which cells are what, and what they are multiplied by.
+/// Indices of the columns, and their units.
 #[derive(Clone, Debug, PartialEq)]
 struct Columns {
     time: usize,
@@ -88,7 +88,7 @@ fn rows(text: &str) -> impl Iterator<Item = (usize, &str)> {
     numbered.filter(|(_, row)| !row.is_empty() && !row.starts_with('#'))
 }
 
-/// Whether the first row is numbers, with spaces in between.
+/// Returns whether the first row consists of numbers separated by spaces.
 fn is_tum(text: &str) -> bool {
     let Some((_, first)) = rows(text).next() else { return false };
     let mut cells = first.split_whitespace();
@@ -109,14 +109,14 @@ fn push(
     }
     let number = |cell: &str| match cell.parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),
-        _ => Err(row(format!("'{cell}' is no number"))),
+        _ => Err(row(format!("'{cell}' is not a number"))),
     };
-    let time = cells.get(columns.time).ok_or_else(|| row("no time in it".to_owned()))?;
+    let time = cells.get(columns.time).ok_or_else(|| row("the row has no time".to_owned()))?;
     let at_s = number(time)? * columns.time_unit;
     let [x, y, z] = position;
     let position_m = DVec3::new(number(x)?, number(y)?, number(z)?) * columns.unit_m;
     if position_m.abs().max_element() > FARTHEST_M {
-        let what = format!("{position_m:.0} m is nowhere; are these metres?");
+        let what = format!("{position_m:.0} m is out of range; are these metres?");
         return Err(row(what));
     }
     match found.last() {
@@ -132,7 +132,7 @@ fn push(
     Ok(())
 }
 
-/// Returns the first line of the data, and what its columns are.
+/// Returns the first line of the data, and its columns.
 fn header(text: &str) -> Result<(usize, Columns), RecordingError> {
     // Comments may be headers: EuRoC's begins with #.
     let lines: Vec<Vec<Name>> = text.lines().take(HEAD).map(names).collect();
@@ -147,7 +147,7 @@ fn header(text: &str) -> Result<(usize, Columns), RecordingError> {
             (None, Some(frame)) => (frame, 1.0 / rate_hz(&lines[..k])?),
             (None, None) => return Err(RecordingError::NoTime { line }),
         };
-        // Units stand in the header, below it, or, of a whole file, in its first line.
+        // Units are in the header, below it, or, for the whole file, in its first line.
         let below = lines.get(line).and_then(|row| row.get(position[0]));
         let below = below.and_then(|cell| length_m(&cell.word));
         let unit_m = length_m(&cells[position[0]].unit).or(below).or_else(|| whole_m(&lines[0]));
@@ -157,14 +157,14 @@ fn header(text: &str) -> Result<(usize, Columns), RecordingError> {
     Err(RecordingError::NoHeader)
 }
 
-/// A cell of a header: what it names, and in which unit.
+/// A cell of a header: name and unit.
 #[derive(Clone, Debug, Default, PartialEq)]
 struct Name {
     word: String,
     unit: String,
 }
 
-/// Splits a header's row: `#timestamp [ns]`, `p_x (mm)`, `stamp_ns` and `x_m` are all understood.
+/// Splits a header row. Accepts `#timestamp [ns]`, `p_x (mm)`, `stamp_ns` and `x_m`.
 fn names(row: &str) -> Vec<Name> {
     let cell = |cell: &str| {
         let lower =
@@ -183,8 +183,8 @@ fn names(row: &str) -> Vec<Name> {
     row.split(',').map(cell).collect()
 }
 
-/// Returns the first three neighbours that name a position; where rows above say which triples are turns and which
-/// places, a place.
+/// Returns the first three adjacent columns that name a position. If the row above marks columns as rotation or
+/// position, only positions count.
 fn position(cells: &[Name], above: &[Name]) -> Option<[usize; 3]> {
     let axis = |k: usize, axis: &str| {
         let word = cells.get(k).map_or("", |cell| cell.word.as_str());
@@ -217,13 +217,13 @@ fn length_m(unit: &str) -> Option<f64> {
     }
 }
 
-/// Motive's first line: `..., Length Units, Millimeters, ...`.
+/// Reads the unit from Motive's first line: `..., Length Units, Millimeters, ...`.
 fn whole_m(first: &[Name]) -> Option<f64> {
     let key = first.iter().position(|cell| cell.word == "length units")?;
     length_m(&first.get(key + 1)?.word)
 }
 
-/// Returns the frames a second: Motive's `Export Frame Rate`, or the number alone in a row of Vicon's.
+/// Returns the frame rate: Motive's `Export Frame Rate`, or the single number in a row of Vicon's header.
 fn rate_hz(above: &[Vec<Name>]) -> Result<f64, RecordingError> {
     let number = |cell: &Name| cell.word.parse::<f64>().ok().filter(|hz| (1.0..=1e5).contains(hz));
     let named = above.iter().find_map(|row| {
@@ -237,11 +237,11 @@ fn rate_hz(above: &[Vec<Name>]) -> Result<f64, RecordingError> {
     named.or(alone).ok_or(RecordingError::NoRate)
 }
 
-/// Rows before the data, at most.
+/// Maximum number of header rows.
 const HEAD: usize = 40;
-/// What columns of time are called.
+/// Names of time columns.
 const TIMES: [&str; 6] = ["t", "time", "timestamp", "stamp", "time_stamp", "sec"];
-/// What stands before x, y and z of a position.
+/// Prefixes of x, y and z of a position.
 const PREFIXES: [&str; 9] = [
     "",
     "t",
@@ -254,7 +254,7 @@ const PREFIXES: [&str; 9] = [
     "translation",
 ];
 const UNITS: [&str; 7] = ["s", "ms", "us", "ns", "m", "cm", "mm"];
-/// As far as an arena's positions go. [m]
+/// Maximum coordinate, the limit of an arena's positions. [m]
 const FARTHEST_M: f64 = 1e5;
 
 #[cfg(test)]
@@ -275,7 +275,7 @@ mod tests {
     const TWO: [(f64, [f64; 3]); 2] = [(0.5, [1.0, 2.0, 3.0]), (0.51, [1.5, 2.0, -3.0])];
 
     #[test]
-    fn files_of_all_kinds_give_the_same_track() {
+    fn reads_the_same_track_from_all_formats() {
         check("t,x,y,z\n0.5,1,2,3\n0.51,1.5,2,-3\n", &TWO);
         check(
             "stamp_ns,x_m,y_m,z_m,qx,qy,qz,qw\n500000000,1,2,3,0,0,0,1\n510000000,1.5,2,-3,0,0,0,1",
@@ -287,12 +287,12 @@ mod tests {
              500000000,1,2,3,1\r\n510000000,1.5,2,-3,1\r\n",
             &TWO,
         );
-        // TUM's, with its comments.
+        // TUM's format, with its comments.
         check(
             "# ground truth\n# timestamp tx ty tz qx qy qz qw\n0.5 1 2 3 0 0 0 1\n0.51 1.5 2 -3 0 0 0 1\n",
             &TWO,
         );
-        // Motive's, the point lost in between.
+        // Motive's export; the point is lost in between.
         check(
             "Format Version,1.23,Take Name,a,Capture Frame Rate,100.000000,Export Frame Rate,100.000000,Rotation Type,\
              Quaternion,Length Units,Millimeters,Coordinate Space,Global\n\n\
@@ -303,7 +303,7 @@ mod tests {
              50,0.5,0.1,0.2,0.3,0.9,1000,2000,3000\n51,0.505,,,,,,,\n51,0.51,0.1,0.2,0.3,0.9,1500,2000,-3000\n",
             &TWO,
         );
-        // Vicon's, without a time: 100 Hz, in millimetres.
+        // Vicon's export, without a time: 100 Hz, in millimetres.
         check(
             "Objects\n100\n,,Cam,,,,,\nFrame,Sub Frame,RX,RY,RZ,TX,TY,TZ\n,,rad,rad,rad,mm,mm,mm\n\
              50,0,0.1,0,0,1000,2000,3000\n51,0,0.1,0,0,1500,2000,-3000\n",
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named_with_its_line() {
+    fn error_names_the_fault_and_its_line() {
         let refused = |text: &str, expected: &str| {
             let error = parse(text).unwrap_err().to_string();
             assert!(error.contains(expected), "'{error}' lacks '{expected}'");
@@ -321,17 +321,17 @@ mod tests {
         refused("<html>", "no row names its columns");
         refused("x,y,z\n1,2,3\n", "names no time");
         refused("frame,x,y,z\n1,1,2,3\n", "frame rate");
-        refused("t,x,y,z\n1,2,3,4\n2,3,oops,4\n", "line 3: 'oops' is no number");
+        refused("t,x,y,z\n1,2,3,4\n2,3,oops,4\n", "line 3: 'oops' is not a number");
         refused("t,x,y,z\n1,2,3,4\n0.5,2,3,4\n", "line 3: time goes back");
         refused("t,x,y,z\n1,2,3,inf\n", "line 2: 'inf'");
         refused("t,x,y,z\n1,2e9,3,4\n", "line 2");
-        refused("t,x,y,z\n1,2,3,4\n", "1 poses are no track");
+        refused("t,x,y,z\n1,2,3,4\n", "1 poses are too few for a track");
         refused("0 1 2 3\n1 2\n", "line 2");
     }
 
     proptest! {
         #[test]
-        fn a_written_track_is_read_again(
+        fn reads_back_a_written_track(
             points in prop::collection::vec((0.001..1.0f64, prop::array::uniform3(-50.0..50.0f64)), 2..40),
             tum in any::<bool>(),
         ) {
@@ -346,7 +346,7 @@ mod tests {
         }
 
         #[test]
-        fn no_text_panics(text in "(t|x|y|z|,|\n|[0-9.]|#|frame|Position|mm|\\(| |-|nan){0,80}") {
+        fn does_not_panic_on_any_text(text in "(t|x|y|z|,|\n|[0-9.]|#|frame|Position|mm|\\(| |-|nan){0,80}") {
             if let Ok(track) = parse(&text) {
                 prop_assert!(track.iter().all(|t| t.at_s.is_finite() && t.position_m.is_finite()));
                 prop_assert!(track.windows(2).all(|two| two[0].at_s < two[1].at_s));

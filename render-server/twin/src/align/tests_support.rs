@@ -15,7 +15,7 @@ fn vector(reach: f64) -> impl Strategy<Value = DVec3> {
     prop::array::uniform3(-reach..reach).prop_map(DVec3::from_array)
 }
 
-/// Any place and size.
+/// Any position, rotation and scale.
 pub(super) fn similarity() -> impl Strategy<Value = Similarity> {
     (0.01..20.0f64, vector(3.0), vector(10.0)).prop_map(|(scale, turn, translation_m)| Similarity {
         scale,
@@ -24,7 +24,6 @@ pub(super) fn similarity() -> impl Strategy<Value = Similarity> {
     })
 }
 
-/// So many points.
 pub(super) fn spread(count: std::ops::Range<usize>) -> impl Strategy<Value = Vec<DVec3>> {
     prop::collection::vec(vector(10.0), count)
 }

@@ -1,50 +1,50 @@
-//! A scene's place by a motion capture that followed the camera.
+//! Alignment by a motion capture that tracked the camera.
 //!
-//! The tracked point is not the lens: it sits beside it, at a place in the camera's axes that hardly anybody has measured.
-//! Nor do two recordings begin at one instant. Both are solved with the scene's place; but a camera that is carried level,
-//! however it turns, does not show how high the point sits above it. Then it must be measured.
+//! The tracked point is not the lens: its offset in the camera's axes is usually unmeasured. The clocks of the two
+//! recordings also differ. Both are solved together with the alignment. But a camera that is carried level, however it
+//! turns, does not determine the height of the tracked point above the lens; then the offset must be measured.
 
 use glam::{DMat3, DQuat, DVec3};
 
 use super::points::{self, Pair};
 use super::{AlignError, Fit};
 
-/// A camera of the capture.
+/// A camera pose of the capture.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CameraPose {
-    /// When the image was taken, on the capture's clock. [s]
+    /// Time of the image on the capture's clock. [s]
     pub at_s: f64,
-    /// The lens. [scene]
+    /// Position of the lens. [scene]
     pub position: DVec3,
-    /// The camera's axes to the scene's.
+    /// Rotation from the camera's axes to the scene's.
     pub rotation: DQuat,
 }
 
-/// A place of the tracked point.
+/// Position of the tracked point at one instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tracked {
-    /// When it was there, on the motion capture's clock. [s]
+    /// Time on the motion capture's clock. [s]
     pub at_s: f64,
-    /// Where. [m, world]
+    /// Position. [m, world]
     pub position_m: DVec3,
 }
 
-/// The scene's place, and what was solved with it.
+/// Alignment, and the values solved with it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrackFit {
-    /// The place.
+    /// Alignment.
     pub fit: Fit,
-    /// What the motion capture's clock shows more than the capture's. [s]
+    /// Motion capture's clock minus the capture's clock. [s]
     pub offset_s: f64,
-    /// The tracked point in the camera's axes. [m]
+    /// Tracked point in the camera's axes. [m]
     pub point_in_cam_m: DVec3,
 }
 
-/// Finds the scene's place by cameras and a track, ascending in time, whose clocks differ by at most `max_offset_s`. Where
-/// the tracked point was measured, `measured_m` [m, cam], it is not solved.
+/// Aligns a scene by cameras and a track, both ascending in time, whose clocks differ by at most `max_offset_s`. If the
+/// position of the tracked point is given in `measured_m` [m, cam], it is not solved.
 ///
 /// # Errors
-/// Too few cameras within the track, a camera that hardly moved or turned, or as [`points::fit`].
+/// Too few cameras within the track, a camera that hardly moved or turned, or errors of [`points::fit`].
 pub fn fit(
     cameras: &[CameraPose],
     track: &[Tracked],
@@ -53,10 +53,10 @@ pub fn fit(
     measured_m: Option<DVec3>,
 ) -> Result<TrackFit, AlignError> {
     if !measured_m.is_none_or(DVec3::is_finite) {
-        return Err(AlignError::BadNumber("the place of the tracked point"));
+        return Err(AlignError::BadNumber("the position of the tracked point"));
     }
     if !(max_offset_s >= 0.0 && max_offset_s.is_finite()) {
-        return Err(AlignError::BadNumber("the greatest offset of the clocks"));
+        return Err(AlignError::BadNumber("the maximum offset of the clocks"));
     }
     let finite =
         |c: &CameraPose| c.at_s.is_finite() && c.position.is_finite() && c.rotation.is_finite();
@@ -68,7 +68,8 @@ pub fn fit(
     if measured_m.is_none() {
         check_turns(cameras)?;
     }
-    // Coarse first: the motion of a hand has a period of a second, and a search must not step over its best place.
+    // Coarse search first. Its step is small enough not to miss the optimum: hand motion has a period of about a
+    // second.
     let count = (max_offset_s / COARSE_S).ceil().min(MAX_STEPS) as i64;
     let step_s = if count == 0 { 0.0 } else { max_offset_s / count as f64 };
     let mut best: Option<(f64, TrackFit)> = None;
@@ -107,7 +108,7 @@ pub fn fit(
     Ok(found)
 }
 
-/// Returns the mean square of what is left [m^2], and the place, for one offset of the clocks.
+/// Returns the mean squared residual [m^2] and the alignment for one clock offset.
 fn at_offset(
     cameras: &[CameraPose],
     track: &[Tracked],
@@ -126,7 +127,8 @@ fn at_offset(
             needed: NEEDED.max(cameras.len() / 2),
         });
     }
-    // The point's place in units of the scene; with it known, the rest is matched points, and the other way round.
+    // Position of the tracked point in units of the scene. Iterate: with it known, the rest is matching of points, and
+    // the other way round.
     let mut point = DVec3::ZERO;
     let mut found = None;
     for _ in 0..ROUNDS {
@@ -140,7 +142,7 @@ fn at_offset(
         let fit = place(&pairs, sigma_m)?;
         let back = fit.world_from_scene;
         if let Some(measured_m) = measured_m {
-            // Known in metres; the scene's unit is not.
+            // Known in metres, but the scene's unit is not.
             let before = point;
             point = measured_m / back.scale;
             found = Some(fit);
@@ -150,8 +152,8 @@ fn at_offset(
             continue;
         }
         let (mut change, mut used) = (DVec3::ZERO, 0.0);
-        // What is left, in the camera's axes, whose mean the point's place explains; but for what a shift of the whole
-        // scene explains as well, which is the mean in the scene's axes.
+        // Residuals in the camera's axes: their mean determines the point's position, apart from what a shift of the
+        // complete scene explains as well. That is the mean in the scene's axes.
         let left = |pair: &Pair| {
             back.rotation.conjugate() * (pair.world_m - back.transform_point(pair.scene))
                 / back.scale
@@ -177,12 +179,13 @@ fn at_offset(
             break;
         }
     }
-    let fit = found.ok_or(AlignError::HardlyMoved("its turns say nothing"))?;
+    let fit =
+        found.ok_or(AlignError::HardlyMoved("its rotations do not determine the tracked point"))?;
     let point_in_cam_m = point * fit.world_from_scene.scale;
     Ok((fit.rms_m.powi(2), TrackFit { fit, offset_s, point_in_cam_m }))
 }
 
-/// Returns the track's place at an instant, unless it has a hole there. [m, world]
+/// Returns the interpolated position at a time, or `None` in a gap of the track. [m, world]
 fn at(track: &[Tracked], at_s: f64) -> Option<DVec3> {
     let after = track.partition_point(|tracked| tracked.at_s < at_s);
     let next = track.get(after)?;
@@ -193,7 +196,7 @@ fn at(track: &[Tracked], at_s: f64) -> Option<DVec3> {
     (gap_s <= MAX_GAP_S).then(|| last.position_m.lerp(next.position_m, (at_s - last.at_s) / gap_s))
 }
 
-/// A camera that always looks the same way does not show where the tracked point is.
+/// Rejects a camera with a constant orientation, which does not determine the tracked point's position.
 fn check_turns(cameras: &[CameraPose]) -> Result<(), AlignError> {
     if cameras.len() < NEEDED {
         return Err(AlignError::TooFew { given: cameras.len(), needed: NEEDED });
@@ -207,26 +210,27 @@ fn check_turns(cameras: &[CameraPose]) -> Result<(), AlignError> {
     if least > TURNS {
         Ok(())
     } else {
-        Err(AlignError::HardlyMoved("it turned about one axis alone, or not at all"))
+        Err(AlignError::HardlyMoved("it turned about only one axis, or not at all"))
     }
 }
 
-/// Cameras within the track, at least.
+/// Minimum number of cameras within the track.
 const NEEDED: usize = 6;
-/// A hand that films moves at some 2 Hz; ten of these a period. [s]
+/// Step of the coarse search: a hand-held camera moves at about 2 Hz, so ten steps per period. [s]
 const COARSE_S: f64 = 0.05;
-/// 1 m/s for this is a millimetre. [s]
+/// Resolution of the clock offset: 1 mm at 1 m/s. [s]
 const FINE_S: f64 = 0.001;
-/// 100 s to each side.
+/// Maximum number of coarse steps to each side: 100 s.
 const MAX_STEPS: f64 = 2000.0;
 const ROUNDS: usize = 30;
-/// The tracked point moves by less than this. [m]
+/// Convergence limit of the tracked point's motion. [m]
 const CONVERGED_M: f64 = 1e-7;
-/// How well the tracked point's place is measured by hand, one sigma. [m]
+/// Standard deviation of a hand-measured position of the tracked point. [m]
 const RULER_M: f64 = 0.005;
-/// A motion capture that loses the point for longer says nothing in between. [s]
+/// Maximum gap of the track that is interpolated. [s]
 const MAX_GAP_S: f64 = 0.1;
-/// Of each axis' direction, one less the square of its mean: turns of 8 degrees to each side.
+/// Minimum spread of the orientations: 1 minus the squared mean of each axis' direction; turns of 8 degrees to each
+/// side.
 const TURNS: f64 = 0.02;
 
 #[cfg(test)]
@@ -236,7 +240,7 @@ mod tests {
     use crate::align::tests_support::gauss;
     use crate::random::Random;
 
-    /// A walk of 20 s: cameras every 0.4 s in the scene's frame; the track at 100 Hz in the world.
+    /// Returns a walk of 20 s: cameras every 0.4 s in the scene's frame, the track at 100 Hz in the world.
     fn walk(truth: &Similarity, offset_s: f64, beside_m: DVec3) -> (Vec<CameraPose>, Vec<Tracked>) {
         let pose = |t: f64| {
             let p_m = DVec3::new(
@@ -274,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn place_clock_and_tracked_point_are_found() {
+    fn finds_alignment_clock_offset_and_tracked_point() {
         let truth = truth();
         let beside_m = DVec3::new(0.02, -0.08, -0.03);
         for offset_s in [0.0, 0.137, -1.42] {
@@ -297,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn a_walk_that_shows_nothing_is_refused() {
+    fn rejects_walks_that_determine_nothing() {
         let (mut cameras, track) = walk(&truth(), 0.0, DVec3::ZERO);
         let few = fit(&cameras[..4], &track, 1.0, 0.002, None);
         assert_eq!(few, Err(AlignError::TooFew { given: 4, needed: 6 }));
@@ -313,9 +317,9 @@ mod tests {
         assert!(matches!(nowhere, Err(AlignError::BadNumber(_))));
     }
 
-    /// Carried level, as people do: only a ruler tells how high above the lens the marker sits.
+    /// The camera is carried level, as people do: only a measurement gives the height of the marker above the lens.
     #[test]
-    fn a_level_camera_needs_a_measured_point() {
+    fn level_camera_needs_a_measured_point() {
         let truth = truth();
         let beside_m = DVec3::new(0.02, -0.08, -0.03);
         let (mut cameras, mut track) = walk(&truth, 0.3, DVec3::ZERO);

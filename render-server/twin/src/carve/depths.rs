@@ -1,5 +1,5 @@
-//! How far each photo looks: the trained scene's depth at its pose, held against the points that structure
-//! from motion saw in it.
+//! Viewing distance of each photo: depth of the trained scene at its pose, checked against the points of structure from
+//! motion.
 
 use rayon::prelude::*;
 use vizflyt_protocol::geometry::Pose;
@@ -11,18 +11,19 @@ use crate::dataset::{Dataset, Photo};
 #[derive(Debug)]
 pub(super) struct Depths {
     pub(super) photos: Vec<PhotoDepths>,
-    /// Points of which the photos' rays fell short.
+    /// Number of points that the rendered depth hides.
     pub(super) hidden_points: usize,
-    /// Points there are, once a photo.
+    /// Number of points, counted once per photo.
     pub(super) points: usize,
 }
 
-/// Depths of one photo, H x W camera-z.
+/// Camera-z depths of one photo, H x W.
 #[derive(Debug)]
 pub(super) struct PhotoDepths {
-    /// Where half of the light has stopped; 0 where it never does.
+    /// Depth at which half of the light has stopped; 0 if less stops.
     pub(super) surface: Vec<f32>,
-    /// To where the ray is free for certain: the nearest surface around, less what that may be off.
+    /// Depth up to which the ray is certainly free: the nearest surface of the neighbouring pixels, minus the depth
+    /// error.
     pub(super) free: Vec<f32>,
 }
 
@@ -35,7 +36,7 @@ impl Depths {
             .iter()
             .map(|photo| {
                 let camera = camera(photo);
-                // A pose or lens that cannot be rendered shows nothing.
+                // A pose or lens that cannot be rendered gives no depth.
                 match renderer.render(&[], &[camera], &mut images) {
                     Ok(_) => images[0].depth_median_m.clone(),
                     Err(_) => vec![0.0; photo.view.width * photo.view.height],
@@ -56,7 +57,7 @@ impl Depths {
 }
 
 impl PhotoDepths {
-    /// Returns the depths, and how many of the photo's points they fall short of.
+    /// Returns the depths, and the number of the photo's points that they hide.
     fn of(photo: &Photo, surface: Vec<f32>, depth_error: f32) -> (Self, usize) {
         let (width, height) = (photo.view.width, photo.view.height);
         let mut free = least_around(&surface, width, height);
@@ -65,7 +66,7 @@ impl PhotoDepths {
         }
         let mask = &photo.target.mask;
         if !mask.is_empty() {
-            // What was masked moved, or was not there.
+            // Masked pixels showed moving or absent things.
             free.iter_mut().zip(mask).filter(|(_, mask)| **mask == 0).for_each(|(z, _)| *z = 0.0);
         }
         let mut hidden = 0;
@@ -75,11 +76,11 @@ impl PhotoDepths {
             hidden += usize::from(surface[point.pixel as usize] < nearest);
             for y in y.saturating_sub(AROUND_POINT)..(y + AROUND_POINT + 1).min(height) {
                 for x in x.saturating_sub(AROUND_POINT)..(x + AROUND_POINT + 1).min(width) {
-                    // Something is there: what is rendered behind it is a hole of the training.
+                    // The point is a surface: a larger rendered depth means a hole of the training.
                     free[y * width + x] = free[y * width + x].min(nearest);
                 }
             }
-            // The ray to the point itself has been: what is rendered before it is a floater.
+            // The photo saw the point: a smaller rendered depth means a floater.
             free[point.pixel as usize] = nearest;
         }
         (Self { surface, free }, hidden)
@@ -94,7 +95,7 @@ fn camera(photo: &Photo) -> Camera {
     Camera::new(view.intrinsics(), pose, view.near)
 }
 
-/// Returns for every pixel the least of itself and its eight neighbours.
+/// Returns the minimum of each pixel and its eight neighbours.
 fn least_around(image: &[f32], width: usize, height: usize) -> Vec<f32> {
     let mut rows = vec![0.0; image.len()];
     for (out, row) in rows.chunks_exact_mut(width).zip(image.chunks_exact(width)) {
@@ -112,5 +113,5 @@ fn least_around(image: &[f32], width: usize, height: usize) -> Vec<f32> {
     least
 }
 
-/// Within so many pixels of a point it is what a ray meets. [px]
+/// Radius around a point's pixel within which rays end at the point. [px]
 const AROUND_POINT: usize = 1;

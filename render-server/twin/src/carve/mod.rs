@@ -1,16 +1,16 @@
-//! What a capture has proven to be free: its rays, and the way that it was carried.
+//! Free space proven by a capture: its rays, and the path of its camera.
 //!
 //! ```text
 //! Dataset (poses, points) + trained Splats
-//!   depths   how far each photo looks, held against the points that structure from motion saw there
-//!   votes    splats that many photos look through, that hang on the capture's own way, or that
-//!            nobody sees -> pruned
+//!   depths   viewing distance of each photo, checked against points of structure from motion
+//!   votes    splats that many photos look through, that lie on the camera's path, or that no photo
+//!            shows -> pruned
 //!   rays     voxels that several photos looked through                                    -> Seen
 //!   path     voxels in which the camera itself has been                                   -> Seen
 //! ```
-//! Once after a training, in seconds. What no ray has passed is *unseen*: behind surfaces, outside of every
-//! photo, in front of what is only guessed. A referee takes it for solid if its arena says so. Glass, mirrors
-//! and wires thinner than a pixel are no surfaces to photos: rays pass where a vehicle would not.
+//! Carving runs once after a training and takes seconds. Space that no ray has passed is *unseen*: behind surfaces,
+//! outside all photos, in front of guessed surfaces. A referee treats it as solid if its arena says so. Limitation:
+//! glass, mirrors and wires thinner than a pixel are not visible as surfaces, so rays pass where a vehicle would not.
 
 mod depths;
 mod path;
@@ -32,64 +32,64 @@ use path::Path;
 
 pub use voxels::{Seen, Voxels};
 
-/// What counts as proof.
+/// Evidence required for free space.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CarveOptions {
-    /// So many photos must have looked through a voxel.
+    /// Minimum number of photos that must have looked through a voxel.
     pub photos: u8,
-    /// Around the camera, wherever it was, is free. [m]
+    /// Radius around each camera position that is assumed free. [m]
     pub camera_radius_m: f64,
-    /// Photos this close to each other, in the order of their names, are one way. [m]
+    /// Maximum distance of two photos, in the order of their names, between which the camera's path is interpolated.
+    /// [m]
     pub stride_m: f64,
-    /// What a rendered depth may be off, as a share of it.
+    /// Relative error of a rendered depth.
     pub depth_error: f32,
 }
 
 impl Default for CarveOptions {
-    /// Two photos, as one may be rendered wrong; a fist around a phone; a stride; twice the median error of
-    /// depth of a trained hall.
+    /// Two photos, because one may be rendered wrongly; the size of a hand around a phone; a stride; twice the median
+    /// depth error of a trained hall.
     fn default() -> Self {
         Self { photos: 2, camera_radius_m: 0.1, stride_m: 0.75, depth_error: 0.03 }
     }
 }
 
-/// A twin without what stood in the way of its own capture.
+/// A twin without splats in its capture's free space.
 #[derive(Clone, Debug)]
 pub struct Carved {
-    /// In the dataset's frame, as they came, in their order.
+    /// Remaining splats in the dataset's frame, in their original order.
     pub splats: Splats,
-    /// Which of those given are in [`Self::splats`].
+    /// For each given splat, whether it is in [`Self::splats`].
     pub kept: Vec<bool>,
-    /// What was seen. [m, world]
+    /// Seen space. [m, world]
     pub seen: Seen,
-    /// For people.
+    /// Statistics.
     pub counts: CarveCounts,
 }
 
-/// What was found and done.
+/// Statistics of a carving.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct CarveCounts {
-    /// Splats pruned as photos look through them.
+    /// Splats pruned because photos look through them.
     pub looked_through: usize,
-    /// Splats pruned as the camera itself was there.
+    /// Splats pruned because the camera was there.
     pub on_path: usize,
-    /// Splats pruned as no photo shows them.
+    /// Splats pruned because no photo shows them.
     pub hidden: usize,
-    /// Points of structure from motion before which something hid them, and how many there are.
+    /// Points of structure from motion hidden by a splat; out of [`Self::points`].
     pub hidden_points: usize,
-    /// See [`Self::hidden_points`].
+    /// Points of structure from motion, counted once per photo.
     pub points: usize,
     /// Voxels of the region.
     pub voxels: usize,
-    /// Of these, seen.
+    /// Seen voxels of the region.
     pub seen: usize,
-    /// How long it took.
+    /// Computing time. [s]
     pub seconds: f64,
 }
 
-/// Carves a trained scene by the capture that it was trained from: prunes what stands in proven free space, and
-/// says which of `voxels` were seen. `splats` and `dataset` are in the same frame, which `world_from_dataset`
-/// takes to the world.
+/// Carves a trained scene by its own capture: prunes splats in proven free space, and determines which of `voxels` were
+/// seen. `splats` and `dataset` are in the same frame, which `world_from_dataset` transforms to the world.
 pub fn carve(
     dataset: &Dataset,
     splats: &Splats,
@@ -117,7 +117,7 @@ pub fn carve(
         }
         keep(&mut left, &stays);
     }
-    // What hid it may be gone by now.
+    // A splat that hid it may have been pruned.
     let shown: Vec<bool> =
         visible::pixels(dataset, &left).iter().map(|pixels| *pixels >= LEAST_PIXELS).collect();
     counts.hidden = shown.iter().filter(|shown| !**shown).count();
@@ -132,14 +132,14 @@ pub fn carve(
     Carved { splats: left, kept, seen, counts }
 }
 
-/// Takes from those kept so far the ones that do not stay.
+/// Clears the flag of kept splats that do not stay.
 fn mark_pruned(kept: &mut [bool], stays: &[bool]) {
     for (kept, stays) in kept.iter_mut().filter(|kept| **kept).zip(stays) {
         *kept = *stays;
     }
 }
 
-/// Leaves out the splats that do not stay.
+/// Removes the splats that do not stay.
 fn keep(splats: &mut Splats, stays: &[bool]) {
     let numbers = 3 * splats.sh_coefficients();
     retain(&mut splats.means_m, 1, |i| stays[i]);
@@ -149,9 +149,9 @@ fn keep(splats: &mut Splats, stays: &[bool]) {
     retain(&mut splats.sh, numbers, |i| stays[i]);
 }
 
-/// Of all photos together, of one splat: less is behind something in each. [px]
+/// Minimum sum of a splat's visible pixels over all photos; less means that it is hidden in each. [px]
 const LEAST_PIXELS: f32 = 1.0;
-/// Behind a floater may be another.
+/// Number of pruning rounds: behind a floater may be another.
 const ROUNDS: usize = 3;
 
 #[cfg(test)]

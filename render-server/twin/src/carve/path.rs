@@ -1,4 +1,4 @@
-//! The way on which the camera was carried: it has been there, so nothing else is.
+//! Path of the camera: space in which the camera has been is free.
 
 use glam::{DVec3, Mat3, Vec3};
 use rayon::prelude::*;
@@ -8,7 +8,7 @@ use super::{CarveOptions, Seen};
 use crate::align::Similarity;
 use crate::dataset::Dataset;
 
-/// Balls along the way. [m, world]
+/// Balls along the path. [m, world]
 #[derive(Clone, Debug)]
 pub(super) struct Path {
     places_m: Vec<DVec3>,
@@ -16,8 +16,8 @@ pub(super) struct Path {
 }
 
 impl Path {
-    /// Returns the way of a capture: its photos in the order of their names, and between them where they follow
-    /// each other closely.
+    /// Returns the path of a capture: its photos in the order of their names, interpolated between photos that are
+    /// close to each other.
     pub(super) fn of(dataset: &Dataset, world: &Similarity, options: &CarveOptions) -> Self {
         let radius_m = options.camera_radius_m;
         let mut places_m: Vec<DVec3> = Vec::new();
@@ -35,7 +35,7 @@ impl Path {
         Self { places_m, radius_m }
     }
 
-    /// Marks the voxels on the way as seen.
+    /// Marks the voxels on the path as seen.
     pub(super) fn mark(&self, seen: &mut Seen) {
         let reach_m = DVec3::splat(self.radius_m);
         for &p_m in &self.places_m {
@@ -52,7 +52,7 @@ impl Path {
         }
     }
 
-    /// Returns which splats reach onto the way, to [`REACH`] standard deviations.
+    /// Returns for each splat whether it reaches onto the path, with [`REACH`] standard deviations.
     pub(super) fn touches(&self, splats: &Splats, world: &Similarity) -> Vec<bool> {
         let unit = world.scale;
         let back = world.rotation.inverse();
@@ -77,5 +77,5 @@ impl Path {
     }
 }
 
-/// As far as obstacles are baked. [standard deviations]
+/// Size of a splat, as in the baking of obstacles. [standard deviations]
 const REACH: f32 = 2.0;

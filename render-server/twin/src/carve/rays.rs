@@ -1,7 +1,7 @@
-//! Which voxels photos looked through.
+//! Voxels that photos looked through.
 //!
-//! Voxels are taken into photos, not rays into voxels: a column of voxels is a line in each photo's frustum, cut to
-//! the part that the photo shows, and walked. Budget: 1.6 M voxels and 80 photos in a second on two cores.
+//! Voxels are projected into photos instead of tracing rays: a column of voxels is a line in each photo's frustum,
+//! clipped to its visible part. Budget: 1.6 M voxels and 80 photos per second on two cores.
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -12,7 +12,7 @@ use crate::align::Similarity;
 use crate::dataset::Dataset;
 use crate::view::View;
 
-/// Returns the voxels through which at least `photos` photos looked, at their centres.
+/// Returns the voxels whose centres at least `photos` photos looked through.
 pub(super) fn seen(
     dataset: &Dataset,
     depths: &Depths,
@@ -44,12 +44,12 @@ pub(super) fn seen(
     seen
 }
 
-/// Counts the voxels of a column that a photo looks through. The column begins at `first`, and goes on by `step`.
+/// Counts the voxels of a column that a photo looks through. The column begins at `first`, in steps of `step`.
 /// [dataset]
 fn look(view: &View, depths: &PhotoDepths, first: Vec3, step: Vec3, column: &mut [u8]) {
     let (p, d) = (view.in_cam(first), view.in_cam(first + step) - view.in_cam(first));
     let (width, height) = (view.width as f32, view.height as f32);
-    // Shown is where all of these are above 0: each is linear along the column.
+    // A point is visible if all of these are above 0. Each is linear along the column.
     let edges = |v: Vec3| {
         let (x, y) = (view.focal[0] * v.x, view.focal[1] * v.y);
         let [u, v_px] = view.center;

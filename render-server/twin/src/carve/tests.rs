@@ -10,7 +10,7 @@ use crate::view::View;
 
 const SIDE_M: f64 = 0.1;
 
-/// A disc of 0.1, facing z.
+/// Adds a disc with a radius of 0.1, facing z.
 fn push(splats: &mut Splats, at: Vec3, opacity: f32) {
     splats.means_m.push(at);
     splats.scales_m.push(Vec3::new(0.1, 0.1, 0.005));
@@ -19,7 +19,7 @@ fn push(splats: &mut Splats, at: Vec3, opacity: f32) {
     splats.sh.extend([0.5; 3]);
 }
 
-/// A wall at z = 3, 4 wide and 3 high.
+/// Returns a wall at z = 3, 4 wide and 3 high.
 fn wall() -> Splats {
     let mut splats = Splats::default();
     for n in 0..41 * 31 {
@@ -29,7 +29,7 @@ fn wall() -> Splats {
     splats
 }
 
-/// Photos from a line along x at z = 0, looking along z.
+/// Returns photos from a line along x at z = 0, looking along z.
 fn dataset() -> Dataset {
     let intrinsics = Intrinsics::from_horizontal_fov(96, 72, 1.2);
     let photo = |n: usize| {
@@ -43,7 +43,7 @@ fn dataset() -> Dataset {
     Dataset { photos: (0..9).map(photo).collect(), ..Dataset::default() }
 }
 
-/// From behind the camera to behind the wall, in the frame of the photos.
+/// Returns a region from behind the cameras to behind the wall, in the frame of the photos.
 fn region() -> Voxels {
     Voxels { min_m: DVec3::new(-1.5, -1.0, -0.5), side_m: SIDE_M, size: [30, 20, 45] }
 }
@@ -61,23 +61,23 @@ fn is_seen(seen: &Seen, p_m: DVec3) -> bool {
 }
 
 #[test]
-fn before_a_wall_is_seen_and_behind_it_is_not() {
+fn space_in_front_of_a_wall_is_seen_and_behind_it_is_not() {
     let carved = carved(&wall(), &dataset());
     let seen = |x: f64, y: f64, z: f64| is_seen(&carved.seen, DVec3::new(x, y, z));
     assert!(seen(0.05, 0.05, 1.05) && seen(0.05, 0.05, 2.65) && seen(-1.05, 0.55, 2.55));
     assert!(!seen(0.05, 0.05, 3.15) && !seen(0.05, 0.05, 3.75), "behind the wall");
     assert!(!seen(0.05, 0.05, -0.35), "behind the camera");
-    assert!(!seen(1.35, 0.95, 0.35), "beside what it shows");
+    assert!(!seen(1.35, 0.95, 0.35), "outside the photos");
     assert!(seen(0.31, 0.01, 0.01) && seen(0.38, 0.01, -0.04), "where the camera was");
     assert_eq!((carved.counts.looked_through, carved.counts.on_path), (0, 0));
     assert_eq!(carved.counts.seen, carved.seen.count());
 }
 
 #[test]
-fn a_faint_floater_goes_and_so_does_what_stood_on_the_way() {
+fn prunes_faint_floaters_and_splats_on_the_path() {
     let mut splats = wall();
     let wall = splats.len();
-    // Every photo looks through it, as it stops less than half of the light.
+    // It stops less than half of the light, so every photo looks through it.
     push(&mut splats, Vec3::new(0.0, 0.0, 1.5), 0.4);
     push(&mut splats, Vec3::new(0.3, 0.12, 0.0), 0.9);
     let carved = carved(&splats, &dataset());
@@ -89,7 +89,7 @@ fn a_faint_floater_goes_and_so_does_what_stood_on_the_way() {
 }
 
 #[test]
-fn what_no_photo_shows_goes() {
+fn prunes_splats_that_no_photo_shows() {
     let mut splats = wall();
     let wall = splats.len();
     push(&mut splats, Vec3::new(0.0, 0.0, 3.4), 0.9);
@@ -99,7 +99,7 @@ fn what_no_photo_shows_goes() {
 }
 
 #[test]
-fn an_opaque_obstacle_stays_and_hides_what_is_behind_it() {
+fn opaque_obstacle_stays_and_hides_space_behind_it() {
     let mut splats = wall();
     let wall = splats.len();
     for n in 0..25 {
@@ -113,8 +113,8 @@ fn an_opaque_obstacle_stays_and_hides_what_is_behind_it() {
 }
 
 #[test]
-fn a_point_ends_a_ray_that_a_hole_in_the_twin_lets_through_and_carries_one_past_a_floater() {
-    // Nothing at all was trained: rays end nowhere, and prove nothing but by points.
+fn points_end_rays_through_holes_of_the_twin() {
+    // An empty twin: rays have no end, and only points prove free space.
     let mut dataset = dataset();
     let p = Vec3::new(0.05, 0.05, 2.0);
     for photo in &mut dataset.photos {
@@ -125,28 +125,28 @@ fn a_point_ends_a_ray_that_a_hole_in_the_twin_lets_through_and_carries_one_past_
     assert!(is_seen(&nothing.seen, DVec3::new(0.05, 0.05, 1.85)));
     assert!(!is_seen(&nothing.seen, DVec3::new(0.05, 0.05, 2.05)));
     assert!(!is_seen(&nothing.seen, DVec3::new(0.45, 0.45, 1.85)));
-    // With the wall behind it, rays to the point go no further.
+    // With the wall behind it, rays to the point end at the point.
     let walled = carved(&wall(), &dataset);
     assert!(!is_seen(&walled.seen, DVec3::new(0.05, 0.05, 2.05)));
     assert!(is_seen(&walled.seen, DVec3::new(0.55, 0.55, 2.15)));
 }
 
 #[test]
-fn masked_pixels_prove_nothing() {
+fn masked_pixels_prove_no_free_space() {
     let mut dataset = dataset();
     for photo in &mut dataset.photos {
         photo.target.mask = vec![0; 96 * 72];
     }
     let carved = carved(&wall(), &dataset);
     assert!(!is_seen(&carved.seen, DVec3::new(0.05, 0.05, 2.0)));
-    assert!(is_seen(&carved.seen, DVec3::new(0.01, 0.01, 0.01)), "its own way");
+    assert!(is_seen(&carved.seen, DVec3::new(0.01, 0.01, 0.01)), "the camera's path");
 }
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(8))]
-    /// What is seen does not depend on the frame and the unit that a capture happens to have.
+    /// Seen space does not depend on the frame and unit of a capture.
     #[test]
-    fn the_frame_of_the_capture_does_not_matter(
+    fn result_does_not_depend_on_the_frame_of_the_capture(
         axis in prop::array::uniform3(-1.0..1.0f64), shift in prop::array::uniform3(-5.0..5.0f64),
         scale in 0.2..5.0f64,
     ) {
@@ -171,7 +171,7 @@ proptest! {
         let moved = carve(&dataset, &splats, &world, region(), &CarveOptions::default());
         let pairs = plain.seen.bits.iter().zip(&moved.seen.bits);
         let differ: u32 = pairs.map(|(a, b)| (a ^ b).count_ones()).sum();
-        // Centres on the border of a pixel.
+        // Centres on the border of a pixel may differ.
         prop_assert!(differ as usize <= region().len() / 200, "{differ} of {}", region().len());
     }
 }

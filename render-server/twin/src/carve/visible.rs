@@ -1,4 +1,4 @@
-//! Which splats photos show at all: what is behind a surface in every photo was never held by any, and is haze.
+//! Visibility of splats: a splat behind a surface in every photo was constrained by none, and is haze.
 
 use vizflyt_splat::Splats;
 
@@ -8,7 +8,7 @@ use crate::planes::Planes;
 use crate::project::Style;
 use crate::render::{Renderer, channel};
 
-/// Returns how many pixels' worth of each splat all photos show together.
+/// Returns the sum of each splat's visible pixels over all photos.
 pub(super) fn pixels(dataset: &Dataset, splats: &Splats) -> Vec<f32> {
     let gaussians = Gaussians::from_splats(splats);
     let style = Style { degree: splats.sh_degree, antialiased: splats.antialiased };
@@ -19,7 +19,7 @@ pub(super) fn pixels(dataset: &Dataset, splats: &Splats) -> Vec<f32> {
         let (width, height) = (photo.view.width, photo.view.height);
         ones.values.clear();
         ones.resize(channel::BY_COUNT, width, height);
-        // What is summed up through each splat is one for every pixel.
+        // Set the error of every pixel to 1, so that its sum through a splat counts pixels.
         (0..height).for_each(|y| ones.row_mut(channel::ERROR, y).fill(1.0));
         renderer.forward(&gaussians, &photo.view, style);
         rows.clear();

@@ -1,5 +1,5 @@
-//! Which splats hang where photos look through: a floater is seen by the few photos that it was made up for, and
-//! all others look past it, or through its haze.
+//! Floaters: splats that photos look through. A floater appears only in the few photos that caused it; all others look
+//! past it or through its haze.
 
 use rayon::prelude::*;
 use vizflyt_splat::Splats;
@@ -7,8 +7,8 @@ use vizflyt_splat::Splats;
 use super::depths::Depths;
 use crate::dataset::Dataset;
 
-/// Returns which splats many photos look through, and few stop at. `slack` is how far behind a splat's centre a ray
-/// must go on to count. [units of the dataset]
+/// Returns for each splat whether many photos look through it and few end at it. `slack` is the minimum distance that a
+/// ray must continue behind the splat's centre. [units of the dataset]
 pub(super) fn looked_through(
     dataset: &Dataset,
     splats: &Splats,
@@ -18,7 +18,7 @@ pub(super) fn looked_through(
 ) -> Vec<bool> {
     let vote = |i: usize| {
         let [a, b, c] = splats.scales_m[i].to_array();
-        // Of the middle axis: the shorter side of what it looks like, from one deviation to the other.
+        // Two standard deviations of the middle axis: the shorter side of the splat's outline.
         let width = 2.0 * a.max(b).min(a.max(c)).min(b.max(c));
         let (mut through, mut stopped) = (0u32, 0u32);
         for (photo, depths) in dataset.photos.iter().zip(&depths.photos) {
@@ -29,7 +29,7 @@ pub(super) fn looked_through(
             }
             let pixel = y as usize * view.width + x as usize;
             if depths.free[pixel] > z + slack {
-                // Rays pass beside what is thinner than a pixel.
+                // Rays pass next to splats thinner than a pixel.
                 through += u32::from(width * view.focal[0] >= z);
             } else if (depths.surface[pixel] - z).abs() <= slack + depth_error * z {
                 stopped += 1;
@@ -40,7 +40,7 @@ pub(super) fn looked_through(
     (0..splats.len()).into_par_iter().map(vote).collect()
 }
 
-/// Fewer photos prove nothing.
+/// Minimum number of photos that look through.
 const LEAST_THROUGH: u32 = 3;
-/// So many times as many look through as stop.
+/// Minimum ratio of photos that look through to photos that stop.
 const MAJORITY: u32 = 3;

@@ -1,25 +1,24 @@
-//! A grid of voxels along the world's axes, and one bit for each.
+//! A grid of voxels along the world's axes, with one bit per voxel.
 
 use glam::DVec3;
 
-/// Where the voxels lie. Order: x slowest, z fastest.
+/// Position and size of a grid. Order: x slowest, z fastest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Voxels {
-    /// Least corner of the first. [m, world]
+    /// Minimum corner of the grid. [m, world]
     pub min_m: DVec3,
-    /// Side. [m]
+    /// Side of a voxel. [m]
     pub side_m: f64,
-    /// Along x, y and z, each at least 1.
+    /// Number of voxels along x, y and z, each at least 1.
     pub size: [usize; 3],
 }
 
 impl Voxels {
-    /// Returns how many there are.
+    /// Returns the number of voxels.
     pub fn len(&self) -> usize {
         self.size.iter().product()
     }
 
-    /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -42,29 +41,27 @@ impl Voxels {
     }
 }
 
-/// Which voxels were seen to be free.
+/// Voxels that were seen to be free.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Seen {
-    /// Where they are.
     pub voxels: Voxels,
-    /// One bit a voxel in their order, low bit first, `ceil(voxels / 8)` bytes; what is left of the last is 0.
+    /// One bit per voxel in their order, low bit first, `ceil(voxels / 8)` bytes; unused bits are 0.
     pub bits: Vec<u8>,
 }
 
 impl Seen {
-    /// Returns a grid of which nothing was seen.
+    /// Returns a grid without seen voxels.
     pub(super) fn nothing(voxels: Voxels) -> Self {
         Self { voxels, bits: vec![0; voxels.len().div_ceil(8)] }
     }
 
-    /// Whether a voxel was.
     pub fn is_seen(&self, [x, y, z]: [usize; 3]) -> bool {
         let [_, ny, nz] = self.voxels.size;
         let at = (x * ny + y) * nz + z;
         self.bits[at / 8] >> (at % 8) & 1 == 1
     }
 
-    /// Returns how many were.
+    /// Returns the number of seen voxels.
     pub fn count(&self) -> usize {
         self.bits.iter().map(|byte| byte.count_ones() as usize).sum()
     }

@@ -1,8 +1,8 @@
-//! Photos with poses, and points: what training starts from.
+//! Datasets: photos with poses, and points, as the input of a training.
 //!
-//! A folder is nerfstudio's (`transforms.json`) or COLMAP's (`sparse/0`, `images`). Its model is read
-//! first; then every photo once, several at a time: undistorted, made smaller, and kept as bytes. What
-//! all of them will take is known, and bounded, before the first is opened.
+//! A folder has nerfstudio's format (`transforms.json`) or COLMAP's (`sparse/0`, `images`). The model is read first;
+//! then every photo once, several in parallel: undistorted, reduced, and kept as bytes. The total memory is computed
+//! and limited before the first photo is opened.
 
 pub mod colmap;
 mod error;
@@ -25,40 +25,39 @@ use crate::view::View;
 pub use error::DatasetError;
 pub use sparse::{SparseImage, SparseModel, SparsePoint, SparseSighting};
 
-/// A capture whose poses are known. All lengths are in units of the dataset, in its own frame.
+/// A capture with known poses. All lengths are in units of the dataset, in its own frame.
 #[derive(Clone, Debug, Default)]
 pub struct Dataset {
-    /// At least one, in the order of their names.
+    /// Photos in the order of their names; at least two if read from files.
     pub photos: Vec<Photo>,
-    /// Points of structure from motion; may be none.
+    /// Points of structure from motion; may be empty.
     pub points: Vec<Point>,
-    /// Photos that have a pose and are not there: public datasets are thinned out so. At most half of all.
+    /// Names of photos with a pose but without a file, as in thinned public datasets. At most half of all.
     pub absent: Vec<String>,
 }
 
 /// A photo, undistorted.
 #[derive(Clone, Debug)]
 pub struct Photo {
-    /// The file's name within the dataset.
+    /// File name, relative to the dataset.
     pub name: String,
-    /// Where it was taken from.
+    /// Camera and pose.
     pub view: View,
-    /// What it shows.
+    /// Pixels and known depths.
     pub target: Target,
 }
 
 /// A point of structure from motion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
-    /// Where it is.
     pub position: Vec3,
     /// sRGB.
     pub rgb: [u8; 3],
 }
 
 impl Dataset {
-    /// Returns the greatest distance of a camera from their middle, and a tenth more: by it trainers
-    /// scale what has a length. 1 where all cameras are in one place.
+    /// Returns 1.1 times the largest distance of a camera from the cameras' centroid. Trainers scale lengths by it.
+    /// Returns 1 if all cameras are in one place.
     pub fn extent(&self) -> f32 {
         let positions = || self.photos.iter().map(|photo| photo.view.position);
         let middle = positions().sum::<Vec3>() / self.photos.len().max(1) as f32;
@@ -67,13 +66,13 @@ impl Dataset {
     }
 }
 
-/// The name of a photo, and where it was taken from.
+/// Name and pose of a photo.
 pub type PhotoPose = (String, Pose<World, Cam>);
 
-/// Returns the names of a folder's photos and where each was taken from, in the order of their names; no photo is opened.
+/// Returns the names and poses of a folder's photos, in the order of their names, without opening any photo.
 ///
 /// # Errors
-/// As [`Dataset::read`], of the poses.
+/// As in [`Dataset::read`], for the poses.
 pub fn read_poses(folder: &Path) -> Result<Vec<PhotoPose>, DatasetError> {
     let (plans, _) = of_folder(folder)?;
     let mut poses: Vec<_> =
@@ -94,20 +93,20 @@ fn of_folder(folder: &Path) -> Result<(Vec<Plan>, Points), DatasetError> {
 }
 
 impl Dataset {
-    /// Reads a folder; photos become at most `width_px` wide.
+    /// Reads a folder. Photos are reduced to at most `width_px`.
     ///
     /// # Errors
-    /// [`DatasetError`] says which file is wrong, and what to do.
+    /// [`DatasetError`], which names the file and the remedy.
     pub fn read(folder: &Path, width_px: Option<u32>) -> Result<Self, DatasetError> {
         let (plans, points) = of_folder(folder)?;
         Self::of_plans(folder, &plans, points, width_px)
     }
 
-    /// Reads the photos of a model that is known already, from the folder of images that its names are below; photos
-    /// become at most `width_px` wide.
+    /// Reads the photos of a known model; its image names are relative to the folder `images`. Photos are reduced to at
+    /// most `width_px`.
     ///
     /// # Errors
-    /// [`DatasetError`] says which photo is wrong, and what to do.
+    /// [`DatasetError`], which names the photo and the remedy.
     pub fn of_model(
         model: &SparseModel,
         images: &Path,
@@ -152,17 +151,17 @@ impl Dataset {
     }
 }
 
-/// A photo that is not read yet.
+/// A photo that has not been read yet.
 struct Plan {
     name: String,
     image: PathBuf,
     mask: Option<PathBuf>,
-    /// 16-bit PNG and what a step of it is.
+    /// 16-bit PNG and the size of its step.
     depth: Option<(PathBuf, f32)>,
-    /// `Err` is a horizontal field of view that waits for the image's size.
+    /// `Err` is a horizontal field of view; the intrinsics follow from it and the image's size.
     intrinsics: Result<Intrinsics, f64>,
     world_from_cam: Pose<World, Cam>,
-    /// Ids of points that it saw, for depth.
+    /// Ids of the points visible in the photo, for depth.
     seen: Vec<u64>,
 }
 
@@ -170,7 +169,7 @@ type Points = std::collections::BTreeMap<u64, Point>;
 
 fn of_colmap(folder: &Path, model: &Path) -> Result<(Vec<Plan>, Points), DatasetError> {
     let sparse = colmap::read(model)?;
-    // Beside the model where it stands alone.
+    // Folders of images, also for a model without its dataset.
     let images = [folder.join("images"), model.join("images"), folder.to_owned()];
     let images = images.iter().find(|path| path.is_dir()).unwrap_or(&images[0]);
     Ok(plans(&sparse, images, Some(&folder.join("masks"))))
@@ -235,10 +234,10 @@ fn of_nerfstudio(folder: &Path, file: &Path) -> Result<(Vec<Plan>, Points), Data
     Ok((plans.collect(), points))
 }
 
-/// Checks that all photos fit into memory together.
+/// Checks that all photos fit into the memory limit.
 fn check_memory(plans: &[&Plan], width_px: Option<u32>) -> Result<(), DatasetError> {
     let bytes = |plan: &&Plan| {
-        // Where the size waits for the image, the width alone bounds it.
+        // If the size is unknown before the image is read, the width bounds it.
         let side = u64::from(width_px.unwrap_or(1920));
         let pixels = plan
             .intrinsics
@@ -275,7 +274,7 @@ impl Plan {
         if let Some(path) = &self.mask {
             apply_mask(&mut image, &photo::read(path)?).map_err(|found| shape(path, found))?;
         }
-        // By the camera that was given: photos and depths of other sizes become the same.
+        // From the model's camera: photos and depth images of other sizes get the same size.
         let pinhole = photo::pinhole(&given, width_px.map(|w| w.min(camera.width_px)));
         let seen = photo::undistort(&image, &camera, &pinhole);
         let view = View::new(&pinhole, &self.world_from_cam, 0.0);
@@ -307,7 +306,7 @@ impl Plan {
     }
 }
 
-/// Takes out what a mask has black; `Err` is a mask's size of another shape.
+/// Removes the pixels that are black in a mask. `Err` is the mask's size if its aspect ratio differs.
 fn apply_mask(image: &mut Rgba, mask: &Rgba) -> Result<(), (u32, u32)> {
     let (width, height) = (image.width as usize, image.height as usize);
     let (w, h) = (mask.width as usize, mask.height as usize);
@@ -323,7 +322,7 @@ fn apply_mask(image: &mut Rgba, mask: &Rgba) -> Result<(), (u32, u32)> {
     Ok(())
 }
 
-/// Returns depths as a pinhole sees them, the nearest pixel's: between two surfaces there is none.
+/// Returns depths in the pinhole's pixels, by nearest neighbour: interpolation between two surfaces would be wrong.
 fn undistorted_depth(depth: &[u16], k: &Intrinsics, pinhole: &Intrinsics, step: f32) -> Vec<f32> {
     let place = photo::Resampler::new(k, pinhole);
     let pixels = (0..pinhole.height_px).flat_map(|y| (0..pinhole.width_px).map(move |x| (x, y)));
@@ -337,9 +336,9 @@ fn undistorted_depth(depth: &[u16], k: &Intrinsics, pinhole: &Intrinsics, step: 
     pixels.map(|pixel| at(pixel).unwrap_or(0.0)).collect()
 }
 
-/// What is closer to a camera is not seen. [extents of the capture]
+/// Near limit: closer points are not rendered. [extents of the capture]
 const NEAR: f32 = 0.01;
-/// Points seen by fewer images say nothing of depth.
+/// Minimum number of images that see a point whose depth is used.
 const WELL_SEEN: usize = 3;
-/// Of all photos together.
+/// Maximum memory of all photos. [bytes]
 const MAX_BYTES: u64 = 4 << 30;

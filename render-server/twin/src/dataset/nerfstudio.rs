@@ -1,45 +1,44 @@
 //! nerfstudio's transforms.json (docs.nerf.studio, "Data conventions").
 //!
-//! `transform_matrix` takes the camera to the world, its axes as OpenGL has them: x right, y up, z
-//! backward.
+//! `transform_matrix` transforms from the camera to the world, with OpenGL's camera axes: x right, y up, z backward.
 
 use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
 
-/// A dataset as the file has it.
+/// Contents of transforms.json.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Transforms {
-    /// In the order of the file.
+    /// Images in the order of the file.
     pub frames: Vec<Frame>,
     /// File of points, relative to the dataset.
     pub points: Option<String>,
 }
 
-/// An image of it; files are relative to the dataset.
+/// An image and its files, relative to the dataset.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// The image.
+    /// Image file.
     pub file: String,
-    /// 8-bit image: 0 does not count.
+    /// 8-bit mask; pixels with 0 are ignored.
     pub mask: Option<String>,
     /// 16-bit image of camera-z depths.
     pub depth: Option<String>,
-    /// One step of it. [units of the dataset]
+    /// Size of a step of the depth image. [units of the dataset]
     pub depth_step: f32,
-    /// Its lens; `Err` is a horizontal field of view [rad] that waits for the image's size.
+    /// Lens; `Err` is a horizontal field of view [rad], which needs the image's size.
     pub intrinsics: Result<Intrinsics, f64>,
-    /// Where it was taken from.
+    /// Pose of the camera.
     pub world_from_cam: Pose<World, Cam>,
 }
 
-/// Why a text is no transforms.json.
+/// Why a text is not a valid transforms.json.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum TransformsError {
-    /// It is no JSON of this shape, or has a number that cannot be.
+    /// Invalid JSON, or a value out of range.
     #[error("{0}")]
     Damaged(String),
-    /// A lens that is not understood.
+    /// Unsupported lens.
     #[error("camera model {0} is not understood")]
     Lens(String),
 }
@@ -63,7 +62,7 @@ struct FrameEntry {
     transform_matrix: Vec<Vec<f64>>,
 }
 
-/// May stand for all images or for each.
+/// Lens parameters, for all images or for one.
 #[derive(Clone, Debug, Default, Deserialize)]
 struct Lens {
     camera_model: Option<String>,
@@ -145,7 +144,7 @@ impl Lens {
         let distortion = match self.camera_model.as_deref().unwrap_or("OPENCV") {
             "OPENCV_FISHEYE" | "fisheye" => Distortion::KannalaBrandt { k1, k2, k3, k4 },
             "OPENCV" | "SIMPLE_RADIAL" | "RADIAL" | "perspective" if bent => {
-                // A fourth radial term belongs to another model.
+                // A fourth radial coefficient would be another model.
                 if k4 != 0.0 {
                     return Err(TransformsError::Lens("OPENCV with k4".to_owned()));
                 }
@@ -161,9 +160,7 @@ impl Lens {
                 Some(angle) => {
                     Err(damaged(&format!("camera_angle_x is {angle}, not 0.001 to 3.1 rad")))
                 }
-                None => {
-                    Err(damaged("neither fl_x nor camera_angle_x says how wide the image looks"))
-                }
+                None => Err(damaged("neither fl_x nor camera_angle_x gives the field of view")),
             };
         };
         let (Some(w), Some(h)) = (self.w, self.h) else {
@@ -183,7 +180,7 @@ impl Lens {
     }
 }
 
-/// Returns the pose of a matrix from OpenGL's camera to the world.
+/// Returns the pose from a matrix of OpenGL's camera to the world.
 fn pose(matrix: &[Vec<f64>]) -> Result<Pose<World, Cam>, String> {
     let rows: Vec<[f64; 4]> =
         matrix.iter().take(3).filter_map(|row| <[f64; 4]>::try_from(row.as_slice()).ok()).collect();
@@ -191,7 +188,7 @@ fn pose(matrix: &[Vec<f64>]) -> Result<Pose<World, Cam>, String> {
         return Err("transform_matrix is not 4 x 4".to_owned());
     };
     let column = |k: usize| DVec3::new(x[k], y[k], z[k]);
-    // To x right, y down, z forward.
+    // From OpenGL's axes to x right, y down, z forward.
     let axes = DMat3::from_cols(column(0), -column(1), -column(2));
     let off = axes.transpose() * axes - DMat3::IDENTITY;
     let worst = off.to_cols_array().into_iter().fold(0.0, |a: f64, b| a.max(b.abs()));
@@ -202,7 +199,7 @@ fn pose(matrix: &[Vec<f64>]) -> Result<Pose<World, Cam>, String> {
         && position.length() < 1e7)
     {
         return Err(
-            "transform_matrix is no rotation and position; has a scale gone into it?".to_owned()
+            "transform_matrix is not a rotation and position; does it contain a scale?".to_owned()
         );
     }
     Ok(Pose::new(position, DQuat::from_mat3(&axes).normalize()))
@@ -218,7 +215,7 @@ mod tests {
             "transform_matrix": [[1, 0, 0, 5], [0, 0, -1, 6], [0, 1, 0, 7], [0, 0, 0, 1]]}]}"#;
 
     #[test]
-    fn axes_turn_from_opengl() {
+    fn converts_axes_from_opengl() {
         let transforms = parse(TEXT).unwrap();
         let frame = &transforms.frames[0];
         // OpenGL's camera looks along its -z, which is +y of this world; its y is the world's z.
@@ -236,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said() {
+    fn error_names_the_fault() {
         let check = |from: &str, to: &str, says: &str| {
             let error = parse(&TEXT.replace(from, to)).unwrap_err().to_string();
             assert!(error.contains(says), "{error}");

@@ -1,4 +1,4 @@
-//! Image files to photos of a pinhole camera, in the size that is trained with.
+//! Reads image files as photos of a pinhole camera, at the training resolution.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 
 use super::error::{DatasetError, read_file};
 
-/// Pixels of red, green, blue and whether they count (0: not).
+/// Pixels with red, green, blue and validity (0: ignored).
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Rgba {
     pub(super) width: u32,
@@ -20,18 +20,18 @@ pub(super) struct Rgba {
     pub(super) pixels: Vec<[u8; 4]>,
 }
 
-/// Reads a PNG or a JPEG; transparent pixels do not count.
+/// Reads a PNG or a JPEG; transparent pixels are ignored.
 pub(super) fn read(path: &Path) -> Result<Rgba, DatasetError> {
     let bytes = read_file(path)?;
     decode(&bytes).map_err(|what| DatasetError::damaged(path, what))
 }
 
-/// Reads a 16-bit PNG of depths, 0 where there is none; returns its width and height.
+/// Reads a 16-bit PNG of depths, 0 where unknown. Returns its width, height and values.
 pub(super) fn read_depth(path: &Path) -> Result<(u32, u32, Vec<u16>), DatasetError> {
     let bytes = read_file(path)?;
     match png(&bytes).map_err(|what| DatasetError::damaged(path, what))? {
         DynamicImage::ImageLuma16(image) => Ok((image.width(), image.height(), image.into_raw())),
-        _ => Err(DatasetError::damaged(path, "no depth image: that is a PNG of 16-bit grey")),
+        _ => Err(DatasetError::damaged(path, "not a depth image; it must be a 16-bit grey PNG")),
     }
 }
 
@@ -80,7 +80,7 @@ fn jpeg(bytes: &[u8]) -> Result<Rgba, String> {
     Ok(Rgba { width, height, pixels })
 }
 
-/// Returns the pinhole that a photo of a camera becomes: without distortion, at most `width_px` wide.
+/// Returns the pinhole camera of an undistorted photo, at most `width_px` wide.
 pub(super) fn pinhole(camera: &Intrinsics, width_px: Option<u32>) -> Intrinsics {
     let width = width_px.unwrap_or(u32::MAX).clamp(MIN_WIDTH_PX, camera.width_px.max(MIN_WIDTH_PX));
     let width = width.min(camera.width_px);
@@ -98,11 +98,11 @@ pub(super) fn pinhole(camera: &Intrinsics, width_px: Option<u32>) -> Intrinsics 
     }
 }
 
-/// Returns the camera of an image that was shrunk or enlarged since; `None` if its shape is another.
+/// Returns the camera of a scaled image; `None` if the aspect ratio differs.
 pub(super) fn fitted(camera: &Intrinsics, (width, height): (u32, u32)) -> Option<Intrinsics> {
     let across = f64::from(width) / f64::from(camera.width_px);
     let down = f64::from(height) / f64::from(camera.height_px);
-    // A pixel was rounded away, at most.
+    // Tolerance: rounding may have removed one pixel.
     let slack = 1.5 / f64::from(width.min(height));
     ((across / down - 1.0).abs() <= slack).then_some(Intrinsics {
         width_px: width,
@@ -115,17 +115,17 @@ pub(super) fn fitted(camera: &Intrinsics, (width, height): (u32, u32)) -> Option
     })
 }
 
-/// Returns the image as a pinhole would have taken it; what the lens did not show does not count.
+/// Resamples an image to a pinhole camera. Pixels outside the lens's image are ignored.
 pub(super) fn undistort(image: &Rgba, camera: &Intrinsics, pinhole: &Intrinsics) -> Rgba {
     if camera == pinhole {
         return image.clone();
     }
-    // Whole pixels are averaged first, then what is left is sampled between pixels.
+    // Average whole pixels first, then interpolate between pixels.
     let by = (camera.width_px / pinhole.width_px).max(1);
     let small = shrunk(image, by);
     let camera = fitted(camera, (small.width, small.height)).unwrap_or(*camera);
     let place = Resampler::new(&camera, pinhole);
-    // Between whole factors up to four pixels make one.
+    // Between integer factors, use up to four samples per pixel.
     let samples: &[f64] = if camera.width_px > pinhole.width_px { &[0.25, 0.75] } else { &[0.5] };
     let mut pixels = Vec::with_capacity(pinhole.pixels());
     for y in 0..pinhole.height_px {
@@ -149,7 +149,7 @@ pub(super) fn undistort(image: &Rgba, camera: &Intrinsics, pinhole: &Intrinsics)
     Rgba { width: pinhole.width_px, height: pinhole.height_px, pixels }
 }
 
-/// From pixels of a pinhole to those of a lens.
+/// Maps pixels of a pinhole camera to pixels of a lens.
 pub(super) struct Resampler<'a> {
     camera: &'a Intrinsics,
     pinhole: &'a Intrinsics,
@@ -161,7 +161,7 @@ impl<'a> Resampler<'a> {
         Self { camera, pinhole, reach: camera.distortion.reach() }
     }
 
-    /// Returns where the lens shows what the pinhole has at a pixel; `None` beyond its reach.
+    /// Returns the lens's pixel of a pinhole's pixel; `None` beyond the lens's range.
     pub(super) fn at(&self, pixel: DVec2) -> Option<DVec2> {
         let slope = self.pinhole.slope(pixel)?;
         let k = self.camera;
@@ -172,7 +172,7 @@ impl<'a> Resampler<'a> {
     }
 }
 
-/// Returns means over squares of `by` pixels.
+/// Returns the image reduced by averaging squares of `by` pixels.
 fn shrunk(image: &Rgba, by: u32) -> Rgba {
     if by == 1 {
         return image.clone();
@@ -197,13 +197,13 @@ fn shrunk(image: &Rgba, by: u32) -> Rgba {
     Rgba { width, height, pixels }
 }
 
-/// Returns the colour at a continuous pixel, between four; `None` outside or where one does not count.
+/// Returns the bilinearly interpolated colour; `None` outside the image or next to an ignored pixel.
 fn between(image: &Rgba, at: DVec2) -> Option<[f32; 3]> {
     let (width, height) = (f64::from(image.width), f64::from(image.height));
     if !(at.x >= 0.0 && at.y >= 0.0 && at.x <= width && at.y <= height) {
         return None;
     }
-    // The outer half of border pixels is as the pixel.
+    // The outer half of border pixels has the colour of the pixel.
     let x = (at.x - 0.5).clamp(0.0, width - 1.0);
     let y = (at.y - 0.5).clamp(0.0, height - 1.0);
     let (left, top) = (x as u32, y as u32);
@@ -225,16 +225,16 @@ fn between(image: &Rgba, at: DVec2) -> Option<[f32; 3]> {
     Some(sum)
 }
 
-/// Sides of images up to here are read. [px]
+/// Maximum side of an image. [px]
 const MAX_SIDE_PX: u32 = Intrinsics::MAX_SIDE_PX;
-/// Narrower photos teach nothing. [px]
+/// Minimum width for training. [px]
 const MIN_WIDTH_PX: u32 = 16;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// An image whose colour says where it was taken from: red across, green down.
+    /// Returns an image whose colour encodes the viewing direction: red across, green down.
     fn ramp(k: &Intrinsics) -> Rgba {
         let mut pixels = Vec::new();
         for y in 0..k.height_px {
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lens_is_taken_out_and_images_become_smaller() {
+    fn undistorts_and_reduces_images() {
         let pinhole_640 = Intrinsics::from_horizontal_fov(640, 480, 1.2);
         for distortion in [
             Distortion::None,
@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_is_no_image_and_no_panic() {
+    fn rejects_invalid_images_without_panic() {
         for bytes in [&b""[..], b"\xff\xd8", b"\x89PNG\r\n\x1a\n1234", b"GIF89a"] {
             assert!(!decode(bytes).unwrap_err().is_empty());
         }

@@ -1,11 +1,11 @@
-//! PLY files of coloured points, as nerfstudio and other tools write them beside a dataset.
+//! PLY files of coloured points, as in nerfstudio's datasets.
 
 use glam::DVec3;
 
-/// A point of a cloud: where, and its sRGB.
+/// Position and sRGB colour of a point.
 pub type CloudPoint = (DVec3, [u8; 3]);
 
-/// How a property is stored.
+/// Storage type of a property.
 #[derive(Clone, Copy)]
 enum ScalarType {
     Integer { bytes: usize, signed: bool },
@@ -34,7 +34,7 @@ impl ScalarType {
         }
     }
 
-    /// Returns a number of little-endian bytes.
+    /// Returns the value of little-endian bytes.
     fn number(self, bytes: &[u8]) -> f64 {
         let mut eight = [0; 8];
         eight[..bytes.len()].copy_from_slice(bytes);
@@ -50,17 +50,18 @@ impl ScalarType {
     }
 }
 
-/// Reads the vertices of a PLY: `x`, `y`, `z`, and `red`, `green`, `blue` where they are.
+/// Reads the vertices of a PLY: `x`, `y`, `z`, and `red`, `green`, `blue` if present.
 pub fn parse(bytes: &[u8]) -> Result<Vec<CloudPoint>, String> {
     const END: &[u8] = b"end_header";
     let end = bytes.windows(END.len()).take(MAX_HEADER).position(|window| window == END);
-    let end = end.ok_or("no PLY: its header does not end")?;
-    let header = std::str::from_utf8(&bytes[..end]).map_err(|_| "no PLY: its header is no text")?;
+    let end = end.ok_or("not a PLY: its header does not end")?;
+    let header =
+        std::str::from_utf8(&bytes[..end]).map_err(|_| "not a PLY: its header is not text")?;
     let after = bytes[end..].iter().position(|&byte| byte == b'\n');
     let body = after.map_or(&[][..], |at| &bytes[end + at + 1..]);
     let mut lines = header.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());
     if lines.next().as_deref() != Some(&["ply"]) {
-        return Err("no PLY: it does not begin with 'ply'".to_owned());
+        return Err("not a PLY: it does not begin with 'ply'".to_owned());
     }
     let (mut is_text, mut count, mut elements) = (None, 0usize, 0);
     let mut properties: Vec<(String, ScalarType)> = Vec::new();
@@ -101,13 +102,14 @@ pub fn parse(bytes: &[u8]) -> Result<Vec<CloudPoint>, String> {
     };
     let mut row = vec![0.0; properties.len()];
     if is_text.ok_or("its format is not given")? {
-        let text = std::str::from_utf8(body).map_err(|_| "its points are no text")?;
+        let text = std::str::from_utf8(body).map_err(|_| "the points are not text")?;
         let mut numbers = text.split_whitespace();
         for i in 0..count {
             for value in &mut row {
                 let text =
                     numbers.next().ok_or_else(|| format!("it ends at point {i} of {count}"))?;
-                *value = text.parse().map_err(|_| format!("point {i}: '{text}' is no number"))?;
+                *value =
+                    text.parse().map_err(|_| format!("point {i}: '{text}' is not a number"))?;
             }
             add(&row);
         }
@@ -128,7 +130,7 @@ pub fn parse(bytes: &[u8]) -> Result<Vec<CloudPoint>, String> {
     Ok(points)
 }
 
-/// Longer headers are no PLY's. [B]
+/// Maximum length of a header. [B]
 const MAX_HEADER: usize = 1 << 16;
 
 #[cfg(test)]
@@ -139,7 +141,7 @@ mod tests {
         property uchar red\nproperty uchar green\nproperty uchar blue\nelement face 0\nend_header\n";
 
     #[test]
-    fn text_and_binary_say_the_same() {
+    fn reads_text_and_binary_alike() {
         let text = format!("ply\nformat ascii 1.0\n{HEADER}1 2 3 4 5 6\n-1 0.5 0 255 0 9\n");
         let mut binary = format!("ply\nformat binary_little_endian 1.0\n{HEADER}").into_bytes();
         for (x, y, z, rgb) in [(1f32, 2f32, 3f64, [4u8, 5, 6]), (-1.0, 0.5, 0.0, [255, 0, 9])] {
@@ -160,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said() {
+    fn error_names_the_fault() {
         for (text, says) in [
             ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no y"),
             ("ply\nformat binary_big_endian 1.0\nend_header\n", "binary_big_endian"),

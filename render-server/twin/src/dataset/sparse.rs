@@ -1,4 +1,4 @@
-//! What structure from motion leaves, whichever program wrote it.
+//! Result of structure from motion, in a form independent of the program.
 
 use std::collections::HashMap;
 
@@ -8,47 +8,46 @@ use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 /// Cameras, poses and points.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SparseModel {
-    /// In the order of the file.
+    /// Images in the order of the file.
     pub images: Vec<SparseImage>,
-    /// By their ids.
+    /// Points by id.
     pub points: HashMap<u64, SparsePoint>,
 }
 
-/// An image that was placed.
+/// An image with a pose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SparseImage {
-    /// Its name below the folder of images.
+    /// Name, relative to the folder of images.
     pub name: String,
-    /// Its lens, distortion and all.
+    /// Camera with its distortion.
     pub intrinsics: Intrinsics,
-    /// Where it was taken from. [units of the dataset]
+    /// Camera pose. [units of the dataset]
     pub world_from_cam: Pose<World, Cam>,
-    /// The points that it saw.
+    /// Observed points.
     pub seen: Vec<SparseSighting>,
 }
 
-/// A point that was found in an image.
+/// Observation of a point in an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SparseSighting {
-    /// The point's id.
     pub point: u64,
-    /// Where in the image. [px]
+    /// Position in the image. [px]
     pub pixel: DVec2,
 }
 
-/// A point that images saw.
+/// A reconstructed point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SparsePoint {
-    /// Where it is. [units of the dataset]
+    /// Position. [units of the dataset]
     pub position: DVec3,
     /// sRGB.
     pub rgb: [u8; 3],
-    /// How many images saw it.
+    /// Number of images that see the point.
     pub track: usize,
 }
 
-/// Returns `world_from_cam` of COLMAP's rotation (w, x, y, z) and translation of `cam_from_world`;
-/// `None` if that is no pose.
+/// Returns `world_from_cam` from COLMAP's rotation (w, x, y, z) and translation of `cam_from_world`; `None` if they are
+/// not a valid pose.
 pub(super) fn pose([w, x, y, z]: [f64; 4], translation: [f64; 3]) -> Option<Pose<World, Cam>> {
     let q = DQuat::from_xyzw(x, y, z, w);
     let t = DVec3::from_array(translation);

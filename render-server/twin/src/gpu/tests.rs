@@ -1,6 +1,7 @@
-//! The passes of a graphics card against finite differences of the f64 reference and against the processor's,
-//! on whatever adapter there is: software Vulkan (`mesa-vulkan-drivers`) will do. Without any, each test prints
-//! what it skips.
+//! Passes of a graphics card, compared with finite differences of the f64 reference and with the processor.
+//!
+//! The tests use any adapter, also software Vulkan (`mesa-vulkan-drivers`). Without an adapter, each test prints that
+//! it is skipped.
 
 use std::sync::OnceLock;
 
@@ -21,13 +22,13 @@ fn adapter() -> Option<&'static Adapter> {
     adapter
 }
 
-/// Returns passes that start with room for so many pairs.
+/// Returns passes with initial buffers for a number of pairs.
 fn passes(pairs: u32) -> Option<GpuPasses> {
     let budget = Budget { pairs, ..Budget::default() };
     Some(GpuPasses::new(adapter()?, budget).expect("a device"))
 }
 
-/// Renders a view and takes a derivative back to it.
+/// Renders a view and propagates a derivative.
 fn run(
     gpu: &mut GpuPasses,
     gaussians: &Gaussians,
@@ -44,7 +45,7 @@ fn run(
 }
 
 #[test]
-fn derivatives_are_those_of_finite_differences() {
+fn derivatives_match_finite_differences() {
     let Some(mut gpu) = passes(1 << 16) else { return };
     for (degree, antialiased) in [(0, false), (1, false), (3, false), (2, true)] {
         let view = view(35, 21);
@@ -52,13 +53,13 @@ fn derivatives_are_those_of_finite_differences() {
         let gaussians = scene(25, degree, &view, 11 + u64::from(degree));
         let (weights, by) = weights(&view, 5);
         let (_, _, gradient) = run(&mut gpu, &gaussians, &view, style, &by);
-        // Exponentials of drivers are off by 1e-5, and steep Gaussians multiply that.
+        // Exponentials of drivers deviate by 1e-5, and steep Gaussians amplify that.
         assert_differences(&gaussians, &view, style, &weights, &gradient, 4e-3);
     }
 }
 
 #[test]
-fn the_image_is_the_references() {
+fn image_matches_the_reference() {
     let Some(mut gpu) = passes(1 << 16) else { return };
     for (degree, antialiased) in [(0, false), (3, false), (2, true)] {
         let view = view(70, 50);
@@ -75,7 +76,7 @@ fn the_image_is_the_references() {
                     (f64::from(gpu.image().at(c, x, y)) - expected[c]).abs() / z
                 })
                 .fold(0.0, f64::max);
-            // A Gaussian on the threshold of 1/255 is in one image and not in the other.
+            // A Gaussian at the threshold of 1/255 is in one image and not in the other.
             off += usize::from(error > 5e-4);
             assert!(error < 0.03, "{error} at {x}, {y}");
         }
@@ -84,7 +85,7 @@ fn the_image_is_the_references() {
 }
 
 #[test]
-fn gradients_are_the_processors() {
+fn gradients_match_the_processor() {
     let Some(mut gpu) = passes(1 << 16) else { return };
     for (degree, antialiased) in [(0, false), (2, false), (3, true)] {
         let view = view(150, 130);
@@ -103,7 +104,7 @@ fn gradients_are_the_processors() {
         let expected = dense(&gaussians, cpu.seen(), &expected);
         let (_, seen, found) = run(&mut gpu, &gaussians, &view, style, &by);
 
-        // One whose level is that of 1/255 may be seen by either.
+        // A Gaussian at the threshold of 1/255 may be visible on only one of the two.
         let apart = seen.len().abs_diff(seen_by_cpu.len());
         assert!(apart <= 3, "{} rows seen for {}", seen.len(), seen_by_cpu.len());
         let (mut seen, mut gradients) = (Vec::new(), Vec::new());
@@ -123,7 +124,7 @@ fn gradients_are_the_processors() {
 }
 
 #[test]
-fn every_run_and_every_room_gives_the_same_bits() {
+fn results_are_bit_identical_for_all_runs_and_buffer_sizes() {
     let Some(mut gpu) = passes(1 << 20) else { return };
     let (wide, view) = (view(300, 200), view(150, 130));
     let style = Style { degree: 2, antialiased: false };
@@ -134,7 +135,7 @@ fn every_run_and_every_room_gives_the_same_bits() {
         (bits(&image.values), seen, bits(&gradient.values))
     };
     let expected = bits(run(&mut gpu, &gaussians, &view, style, &by));
-    // A larger photo in between leaves its numbers in all buffers.
+    // A larger photo in between leaves its values in all buffers.
     let other = scene(9000, 2, &view, 5);
     run(&mut gpu, &other, &wide, style, &weights(&wide, 2).1);
     assert!(bits(run(&mut gpu, &gaussians, &view, style, &by)) == expected, "the second time");
@@ -145,7 +146,7 @@ fn every_run_and_every_room_gives_the_same_bits() {
 }
 
 #[test]
-fn a_device_that_is_told_what_changed_renders_what_the_host_has() {
+fn uploading_only_changed_rows_renders_the_same_image() {
     let Some(mut gpu) = passes(1 << 16) else { return };
     let (wide, narrow) = (view(300, 200), view(150, 130));
     let style = Style { degree: 2, antialiased: false };
@@ -159,9 +160,9 @@ fn a_device_that_is_told_what_changed_renders_what_the_host_has() {
             |gpu: &GpuPasses| gpu.image().values.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
         assert!(bits(&gpu) == bits(&whole), "{} rows, {changed:?}", gaussians.len());
     };
-    // It has none yet, whatever it is told.
+    // The device has no Gaussians yet, so it must upload all of them.
     check(&gaussians, Changed::Rows { rows: &[], columns: 0 }, &narrow);
-    // Few and many, odd and even numbers; then a larger photo, for which all buffers are new.
+    // Few and many, odd and even counts; then a larger photo, which reallocates all buffers.
     for (count, columns, view) in [
         (1, 3, &narrow),
         (2, 14, &narrow),
@@ -183,7 +184,7 @@ fn a_device_that_is_told_what_changed_renders_what_the_host_has() {
         }
         check(&gaussians, Changed::Rows { rows: &rows, columns }, view);
     }
-    // More of them, and fewer: these it cannot have.
+    // More and fewer Gaussians: the device must upload all of them.
     let more = scene(3001, 2, &narrow, 4);
     check(&more, Changed::Rows { rows: &[3000], columns: 38 }, &narrow);
     let fewer = scene(2000, 2, &narrow, 5);
@@ -191,7 +192,7 @@ fn a_device_that_is_told_what_changed_renders_what_the_host_has() {
 }
 
 #[test]
-fn photos_of_all_sizes_and_no_gaussians_at_all() {
+fn renders_all_photo_sizes_and_empty_scenes() {
     let Some(mut gpu) = passes(1 << 10) else { return };
     let style = Style { degree: 0, antialiased: false };
     for (width, height) in [(1, 1), (16, 16), (15, 33), (97, 3)] {
@@ -212,7 +213,7 @@ fn photos_of_all_sizes_and_no_gaussians_at_all() {
 }
 
 #[test]
-fn poison_leaves_no_trace() {
+fn ignores_gaussians_that_are_not_finite() {
     let Some(mut gpu) = passes(1 << 16) else { return };
     let view = view(32, 32);
     let style = Style { degree: 0, antialiased: false };
@@ -234,7 +235,7 @@ fn poison_leaves_no_trace() {
 }
 
 #[test]
-fn a_lost_device_is_named_and_the_processor_goes_on() {
+fn reports_a_lost_device_and_continues_on_the_processor() {
     let Some(adapter) = adapter() else { return };
     let view = view(40, 30);
     let style = Style { degree: 1, antialiased: false };
@@ -245,7 +246,7 @@ fn a_lost_device_is_named_and_the_processor_goes_on() {
     cpu.forward(&gaussians, Changed::All, &view, style);
     cpu.backward(&gaussians, &view, style, &by, &mut seen, &mut expected);
     let numbers = |of: &[RowGradient]| of.iter().map(|by| by.geometry).collect::<Vec<_>>();
-    // Before the image, or between it and its derivative.
+    // Lose the device before the image, or between the image and its derivative.
     for early in [true, false] {
         let mut passes = Passes::gpu(adapter, Budget::default()).expect("a device");
         assert!(passes.name().starts_with("gpu "));
@@ -264,7 +265,7 @@ fn a_lost_device_is_named_and_the_processor_goes_on() {
 }
 
 #[test]
-fn the_trial_passes_a_right_adapter() {
+fn trial_accepts_a_correct_adapter() {
     if adapter().is_none() {
         return;
     }
@@ -273,7 +274,7 @@ fn the_trial_passes_a_right_adapter() {
 }
 
 #[test]
-fn the_loss_reads_what_a_device_renders() {
+fn loss_of_a_device_image_equals_the_processors() {
     let Some(mut gpu) = passes(1 << 16) else { return };
     let view = view(64, 48);
     let style = Style { degree: 0, antialiased: false };

@@ -1,4 +1,4 @@
-//! Derivatives of the loss against its finite differences.
+//! Compares derivatives of the loss with finite differences.
 
 use super::*;
 use crate::random::Random;
@@ -51,10 +51,10 @@ fn total(image: &Planes, target: &Target, exposure: &Exposure) -> f64 {
 }
 
 #[test]
-fn derivatives_are_those_of_finite_differences() {
+fn derivatives_match_finite_differences() {
     let mut random = Random::new(12);
     let (mut image, target) = (image(&mut random), target(&mut random));
-    // Points on depth pixels or without, in the mask or not: two parts on one pixel are no problem.
+    // Points may be on pixels with or without depth, masked or not: both terms of one pixel add up.
     let mut loss = Loss::default();
     let (_, by_exposure, by) = loss.of(&image, &target, &EXPOSURE, BACKGROUND, &WEIGHTS);
     let by = by.clone();
@@ -72,7 +72,7 @@ fn derivatives_are_those_of_finite_differences() {
             let want = (above - below) / f64::from(2.0 * step);
             let got = f64::from(by.at(channel, x, y));
             let off = (want - got).abs();
-            // A kink of an absolute value may lie in between.
+            // The kink of an absolute value may be between the two samples.
             if off > 2e-5 + 0.02 * want.abs() {
                 bent += 1;
             } else {
@@ -98,19 +98,19 @@ fn derivatives_are_those_of_finite_differences() {
 }
 
 #[test]
-fn spread_is_least_where_everything_is_at_one_depth() {
-    // The mean is held, so its derivative is that of variance about a fixed depth.
+fn spread_is_minimal_at_a_single_depth() {
+    // The mean is held constant, so the derivative is that of the variance about a fixed depth.
     let ray = Ray { alpha: 0.8, mean: 2.0, square: 4.0 };
     assert!(ray.spread() < 1e-6);
     let [first, second, through] = ray.by_spread();
-    // A weight at depth z adds (z - D)^2 / D^2: nothing at D, something before and behind it.
+    // A weight at depth z adds (z - D)^2 / D^2: zero at D, positive in front of and behind it.
     let of = |z: f32| first * z + second * z * z - through;
     assert!(of(2.0).abs() < 1e-6);
     assert!((of(1.0) - 0.25).abs() < 1e-6 && (of(3.0) - 0.25).abs() < 1e-6);
 }
 
 #[test]
-fn the_same_image_has_no_loss() {
+fn identical_images_have_zero_loss() {
     let mut random = Random::new(1);
     let mut image = image(&mut random);
     let mut target = target(&mut random);
@@ -132,7 +132,7 @@ fn the_same_image_has_no_loss() {
 }
 
 #[test]
-fn bends_have_the_derivative_of_finite_differences_and_planes_have_none() {
+fn smoothness_matches_finite_differences_and_is_zero_for_planes() {
     let mut random = Random::new(5);
     let (mut image, truth) = (image(&mut random), {
         let mut truth = Planes::default();
@@ -157,7 +157,7 @@ fn bends_have_the_derivative_of_finite_differences_and_planes_have_none() {
         let (x, y) = (i % WIDTH, i / WIDTH);
         for channel in [channel::FIRST, channel::TRANSMITTANCE] {
             let here = image.at(channel, x, y);
-            // The mean that bends are shares of is held.
+            // The derivative holds the mean inverse depth (the unit of the penalty) constant.
             let whole = mean(&image);
             let mut at = |value: f32| {
                 *image.at_mut(channel, x, y) = value;

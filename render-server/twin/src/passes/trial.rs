@@ -1,4 +1,4 @@
-//! The test scene of a graphics adapter: drivers have been seen to sort wrongly, and to render nothing.
+//! Test scene for graphics adapters: some drivers sort wrongly or render nothing.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
@@ -12,11 +12,11 @@ use crate::random::Random;
 use crate::render::{Renderer, channel};
 use crate::view::View;
 
-/// Root of the mean square by which gradients may be off, in shares of that of the gradients. Right adapters
-/// are off by 1e-4: a splat on the threshold of 1/255 is in one image and not in the other.
+/// Maximum RMS deviation of the gradients, relative to their RMS. Correct adapters deviate by 1e-4: a splat at the
+/// threshold of 1/255 is in one image and not in the other.
 const MAX_OFF: f64 = 1e-2;
 
-/// Returns by how much an adapter's derivatives are off; or what is wrong with it.
+/// Returns the relative deviation of an adapter's derivatives, or the reason to reject it.
 pub(super) fn check(gpu: &mut GpuPasses) -> Result<f64, String> {
     let (gaussians, view) = scene();
     let style = Style { degree: 1, antialiased: false };
@@ -36,14 +36,18 @@ pub(super) fn check(gpu: &mut GpuPasses) -> Result<f64, String> {
         runs.push(dense(&gaussians, seen.iter().map(|&row| row as usize), &found));
     }
     if runs[0] != runs[1] {
-        return Err("finds other derivatives of the same test scene each time".to_owned());
+        return Err("derivatives of the test scene differ between two runs".to_owned());
     }
     let squares =
         |of: &dyn Fn(usize) -> f64| (0..expected.len()).map(|i| of(i).powi(2)).sum::<f64>();
     let apart = squares(&|i| f64::from(runs[0][i]) - f64::from(expected[i]));
     let off = (apart / squares(&|i| f64::from(expected[i]))).sqrt();
-    // Positive, so that NaN is refused.
-    if off <= MAX_OFF { Ok(off) } else { Err(format!("its derivatives are off by {off:.0e}")) }
+    // Positive condition, so that NaN is rejected.
+    if off <= MAX_OFF {
+        Ok(off)
+    } else {
+        Err(format!("derivatives of the test scene deviate by {off:.0e}"))
+    }
 }
 
 /// Returns gradients row by row: geometry, colour.
@@ -61,7 +65,7 @@ fn dense(
     out
 }
 
-/// Returns 5 k Gaussians in many layers, more than one group of the sort holds, and a view of most of them.
+/// Returns 5000 Gaussians in many layers (more than one group of the sort holds), and a view of most of them.
 fn scene() -> (Gaussians, View) {
     let pose = Pose::new(DVec3::ZERO, DQuat::IDENTITY);
     let view = View::new(&Intrinsics::from_horizontal_fov(100, 75, 1.3), &pose, 0.05);
@@ -81,7 +85,7 @@ fn scene() -> (Gaussians, View) {
     (gaussians, view)
 }
 
-/// Returns some derivative by the channels of a view's image.
+/// Returns a random derivative by the channels of a view's image.
 fn derivative(view: &View) -> Planes {
     let mut random = Random::new(9);
     let mut by = Planes::default();

@@ -1,5 +1,5 @@
-//! Derivatives against finite differences of the f64 reference; the image against the reference and
-//! against `vizflyt-splat`'s own renderers.
+//! Compares derivatives with finite differences of the f64 reference, and images with the reference and with
+//! `vizflyt-splat`'s renderers.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
@@ -18,7 +18,7 @@ pub(crate) fn view(width: u32, height: u32) -> View {
     View::new(&Intrinsics::from_horizontal_fov(width, height, 1.4), &pose(), 0.05)
 }
 
-/// Gaussians before the camera, some of them beside the image, some thin, some faint.
+/// Returns Gaussians in front of the camera, some outside the image, some thin, some faint.
 pub(crate) fn scene(count: usize, degree: u8, view: &View, seed: u64) -> Gaussians {
     let mut random = Random::new(seed);
     let mut gaussians = Gaussians::new(degree);
@@ -49,7 +49,7 @@ pub(crate) fn rows(gaussians: &Gaussians) -> Vec<f64> {
     gaussians.values.iter().map(|&v| f64::from(v)).collect()
 }
 
-/// Weights of channels, pixel by pixel, and the same as planes.
+/// Returns random weights of the channels, pixel by pixel, and the same weights as planes.
 pub(crate) fn weights(view: &View, seed: u64) -> (Vec<[f64; channel::COUNT]>, Planes) {
     let mut random = Random::new(seed);
     let mut by = Planes::default();
@@ -80,7 +80,7 @@ fn check_gradients(degree: u8, antialiased: bool, instructions: InstructionSet) 
     assert_differences(&gaussians, &view, style, &weights, &gradient, 2e-3);
 }
 
-/// Returns gradients row by row, zero where nothing was seen.
+/// Returns gradients row by row; zero for unseen rows.
 pub(crate) fn dense(
     gaussians: &Gaussians,
     seen: impl Iterator<Item = usize>,
@@ -97,8 +97,8 @@ pub(crate) fn dense(
     gradient
 }
 
-/// Fails unless a gradient is that of finite differences of the reference, weighted channel by channel, within
-/// a share of itself and as much of what is usual in its column.
+/// Asserts that a gradient equals finite differences of the weighted reference. The tolerance is `share` of the value
+/// plus `share` of its column's RMS.
 pub(crate) fn assert_differences(
     gaussians: &Gaussians,
     view: &View,
@@ -129,7 +129,7 @@ pub(crate) fn assert_differences(
             (above - below) / (2.0 * STEP)
         })
         .collect();
-    // Column by column: what is small in a column is held to what is usual there.
+    // Column by column: small values are compared relative to the column's RMS.
     for column in 0..stride {
         let values = || (column..rows.len()).step_by(stride);
         let usual =
@@ -147,7 +147,7 @@ pub(crate) fn assert_differences(
 }
 
 #[test]
-fn derivatives_are_those_of_finite_differences() {
+fn derivatives_match_finite_differences() {
     for degree in [0, 1, 3] {
         check_gradients(degree, false, InstructionSet::available()[0]);
     }
@@ -155,14 +155,14 @@ fn derivatives_are_those_of_finite_differences() {
 }
 
 #[test]
-fn every_instruction_set_has_the_same_derivatives() {
+fn derivatives_match_on_every_instruction_set() {
     for instructions in InstructionSet::available() {
         check_gradients(0, false, instructions);
     }
 }
 
 #[test]
-fn the_image_is_the_references() {
+fn image_matches_the_reference() {
     for (degree, antialiased) in [(0, false), (3, false), (2, true)] {
         let view = view(70, 50);
         let style = Style { degree, antialiased };
@@ -179,7 +179,7 @@ fn the_image_is_the_references() {
                     let z = if c == channel::SECOND { 10.0 } else { 1.0 };
                     (f64::from(image.at(c, x, y)) - expected[c]).abs() / z
                 });
-                // A Gaussian on the threshold of 1/255 is in one image and not in the other.
+                // A Gaussian at the threshold of 1/255 is in one image and not in the other.
                 off += usize::from(errors.iter().any(|&e| e > 2e-4));
                 for c in 0..channel::COUNT {
                     worst[c] = errors[c].max(worst[c]);
@@ -192,7 +192,7 @@ fn the_image_is_the_references() {
 }
 
 #[test]
-fn the_image_is_that_of_the_renderer_that_flies() {
+fn image_matches_the_flight_renderer() {
     let view = view(70, 50);
     let gaussians = scene(500, 3, &view, 9);
     let mut camera = Camera::new(Intrinsics::from_horizontal_fov(70, 50, 1.4), pose(), view.near);
@@ -240,12 +240,12 @@ fn results_do_not_depend_on_the_number_of_threads() {
     };
     let one = run(1);
     for threads in [2, 3, 7] {
-        assert!(one == run(threads), "{threads} threads make another result");
+        assert!(one == run(threads), "{threads} threads give a different result");
     }
 }
 
 #[test]
-fn poison_leaves_no_trace() {
+fn ignores_gaussians_that_are_not_finite() {
     let view = view(32, 32);
     let style = Style { degree: 0, antialiased: false };
     let mut gaussians = scene(40, 0, &view, 3);

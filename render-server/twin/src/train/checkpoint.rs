@@ -1,4 +1,4 @@
-//! A training under way as bytes: stopped at any step and taken up again, it ends in the same twin.
+//! Checkpoints: bytes from which a training resumes at any step and ends in the same twin.
 //!
 //! ```text
 //! 8 magic, version | u64 of dataset and options | u32 step | u8 degree | u64 random | u64 rows, photos, queue | ...
@@ -14,10 +14,10 @@ use crate::gaussians::Gaussians;
 use crate::passes::Passes;
 use crate::random::Random;
 
-/// What a training has come to, besides its dataset and options.
+/// State of a training, without its dataset and options.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint {
-    /// Of dataset and options.
+    /// Hash of the dataset and options.
     training: u64,
     step: u32,
     gaussians: Gaussians,
@@ -28,29 +28,33 @@ pub struct Checkpoint {
     random: Random,
 }
 
-/// Why a training cannot be taken up again from some bytes. Whichever it is: begin anew.
+/// Why a training cannot resume from a checkpoint. The remedy is always to start it again.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CheckpointError {
-    /// Another file, or another version of this one.
-    #[error("these bytes are no training of this version; begin anew")]
+    /// Another file, or another version.
+    #[error("not a checkpoint of this version; start the training again")]
     Other,
-    /// A number that cannot be.
-    #[error("its {0} cannot be; begin anew")]
+    /// Value out of range.
+    #[error("invalid {0} in the checkpoint; start the training again")]
     Number(&'static str),
-    /// Too few or too many.
-    #[error("it has {found} bytes, and should have {expected}; begin anew")]
+    /// Wrong length.
+    #[error(
+        "the checkpoint has {found} bytes, and should have {expected}; start the training again"
+    )]
     Length {
-        /// Bytes there are.
+        /// Actual length in bytes.
         found: usize,
-        /// Bytes by the header.
+        /// Length by the header, in bytes.
         expected: usize,
     },
-    /// Some byte is not as it was written.
-    #[error("its checksum does not match: it is damaged; begin anew")]
+    /// Damaged contents.
+    #[error(
+        "the checksum of the checkpoint does not match: it is damaged; start the training again"
+    )]
     Checksum,
     /// Photos, poses or options differ.
     #[error(
-        "it is of another dataset, or of other options; give the same as when it was begun, or begin anew"
+        "the checkpoint has another dataset or other options; use the same as before, or start the training again"
     )]
     Training,
 }
@@ -82,10 +86,10 @@ impl Checkpoint {
         bytes
     }
 
-    /// Reads what [`Self::to_bytes`] returned.
+    /// Reads the bytes that [`Self::to_bytes`] returns.
     ///
     /// # Errors
-    /// [`CheckpointError`] for anything else. Allocates no more than `bytes` holds.
+    /// [`CheckpointError`] for any other bytes. Allocates at most as much memory as `bytes` describes.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, CheckpointError> {
         let (header, _) = bytes.split_first_chunk::<HEADER>().ok_or(CheckpointError::Other)?;
         if header[..8] != MAGIC[..] {
@@ -140,14 +144,14 @@ impl Checkpoint {
         Ok(Self { training, step, gaussians, moments, errors, exposures, queue, random })
     }
 
-    /// Returns the steps done.
+    /// Returns the number of completed steps.
     pub fn steps(&self) -> u32 {
         self.step
     }
 }
 
 impl<'a> Trainer<'a> {
-    /// Returns what [`Self::resume`] goes on from.
+    /// Returns the state that [`Self::resume`] continues from.
     pub fn checkpoint(&self) -> Checkpoint {
         Checkpoint {
             training: training(self.dataset, &self.options),
@@ -161,14 +165,14 @@ impl<'a> Trainer<'a> {
         }
     }
 
-    /// Takes up a training again, which then ends as one that was never interrupted: bit for bit on the same kind
-    /// of processor.
+    /// Resumes a training. Its result equals that of an uninterrupted training, bit for bit on the same kind of
+    /// processor.
     ///
     /// # Errors
-    /// [`CheckpointError::Training`] if it was of another dataset or of other options.
+    /// [`CheckpointError::Training`] if the checkpoint has another dataset or other options.
     ///
     /// # Panics
-    /// If the dataset has no photo, or all are held out.
+    /// If the dataset has no photo, or all photos are held out.
     pub fn resume(
         dataset: &'a Dataset,
         options: Options,
@@ -190,7 +194,7 @@ impl<'a> Trainer<'a> {
     }
 }
 
-/// Returns a number that tells trainings apart: by options, and by what is looked at in the dataset.
+/// Returns a hash of the options and of the parts of the dataset that training reads.
 fn training(dataset: &Dataset, options: &Options) -> u64 {
     let mut hash = fnv1a_on(OFFSET, format!("{options:?} {}", dataset.points.len()).as_bytes());
     for Photo { view, target, .. } in &dataset.photos {
@@ -217,26 +221,26 @@ fn exposure(words: &[[u8; 4]]) -> ExposureState {
     state
 }
 
-/// FNV-1a (Fowler, Noll, Vo), 64 bits: finds damage, not malice.
+/// FNV-1a (Fowler, Noll, Vo), 64 bits: detects damage, not tampering.
 fn fnv1a(bytes: &[u8]) -> u64 {
     fnv1a_on(OFFSET, bytes)
 }
 
-/// Goes on with a hash.
+/// Continues a hash with more bytes.
 fn fnv1a_on(hash: u64, bytes: &[u8]) -> u64 {
     bytes
         .iter()
         .fold(hash, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3))
 }
 
-/// What a hash begins with.
+/// Initial value of a hash.
 const OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
 
-/// The last is the version: raise it when bytes, or steps of a training, mean something else.
+/// The last byte is the version: increase it if the format or the meaning of training steps changes.
 const MAGIC: &[u8; 8] = b"viztwin\x01";
 /// Magic, training, step, degree, random, 3 counts.
 const HEADER: usize = 8 + 8 + 4 + 1 + 8 + 3 * 8;
-/// Bytes of an exposure.
+/// Size of an exposure. [bytes]
 const EXPOSURE: usize = 19 * 4;
 
 #[cfg(test)]
@@ -270,13 +274,13 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_written_is_read(degree in 0u8..4, rows in 0usize..9, photos in 0usize..9, seed: u64) {
+        fn reads_back_written_checkpoints(degree in 0u8..4, rows in 0usize..9, photos in 0usize..9, seed: u64) {
             let written = checkpoint(degree, rows, photos, seed);
             prop_assert_eq!(Checkpoint::from_bytes(&written.to_bytes()), Ok(written));
         }
 
         #[test]
-        fn damage_is_found(at in 0usize..1000, bit in 0u32..8) {
+        fn detects_damage(at in 0usize..1000, bit in 0u32..8) {
             let mut bytes = checkpoint(1, 3, 4, 5).to_bytes();
             let at = at % bytes.len();
             bytes[at] ^= 1 << bit;
@@ -284,16 +288,16 @@ mod tests {
         }
 
         #[test]
-        fn noise_is_refused(mut bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
+        fn rejects_random_bytes(mut bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
             prop_assert!(Checkpoint::from_bytes(&bytes).is_err());
-            // Counts of any size, with the right beginning.
+            // Counts of any size after a valid magic number.
             bytes.splice(0..0, *MAGIC);
             prop_assert!(Checkpoint::from_bytes(&bytes).is_err());
         }
     }
 
     #[test]
-    fn every_other_length_is_refused() {
+    fn rejects_wrong_lengths() {
         let bytes = checkpoint(0, 2, 2, 1).to_bytes();
         for length in 0..bytes.len() {
             assert!(Checkpoint::from_bytes(&bytes[..length]).is_err(), "{length}");

@@ -1,6 +1,9 @@
-//! The Gaussians that a training starts with: at the points of structure from motion, and where a photo
-//! has none nearby (floors, ceilings) at the depth that its nearest ones suggest; without points at the
-//! depths of depth images; without those anywhere in what the cameras see.
+//! Initial Gaussians of a training, from the first source available:
+//!
+//! 1. Points of structure from motion. Where a photo has none nearby (floors, ceilings), the depth follows from its
+//!    nearest points.
+//! 2. Depths of depth images.
+//! 3. Random places in the cameras' views.
 
 use glam::{DMat3, DVec3, Quat, Vec3};
 
@@ -10,7 +13,7 @@ use crate::gaussians::Gaussians;
 use crate::neighbours::spacing;
 use crate::random::Random;
 
-/// Returns the first Gaussians, not more than half the budget.
+/// Returns the initial Gaussians, at most half the maximum number.
 pub(super) fn gaussians(dataset: &Dataset, options: &Options, extent: f32) -> Gaussians {
     let mut random = Random::stream(options.seed, 2);
     let most = (options.splats / 2).max(1);
@@ -41,8 +44,8 @@ pub(super) fn gaussians(dataset: &Dataset, options: &Options, extent: f32) -> Ga
     gaussians
 }
 
-/// Returns places between the points that a photo saw, on a coarse grid: where none is near, at the depth
-/// of a plane through the nearest. A plane's inverse depth is affine in the pixel.
+/// Returns places between the points that a photo saw, on a coarse grid: where no point is near, at the depth of a
+/// plane through the nearest points. A plane's inverse depth is affine in the pixel.
 fn between_points(photo: &Photo) -> Vec<(Vec3, [f32; 3])> {
     let Photo { view, target, .. } = photo;
     let known: Vec<[f32; 3]> = target
@@ -75,7 +78,7 @@ fn between_points(photo: &Photo) -> Vec<(Vec3, [f32; 3])> {
                 continue;
             }
             let inverse = plane(nearest, step as f64);
-            // Not much nearer, nor much further, than what it was guessed from.
+            // Not much nearer or farther than the points it is interpolated from.
             let (low, high) = nearest
                 .iter()
                 .fold((f32::INFINITY, 0f32), |(low, high), n| (low.min(n.3), high.max(n.3)));
@@ -87,8 +90,8 @@ fn between_points(photo: &Photo) -> Vec<(Vec3, [f32; 3])> {
     places
 }
 
-/// Returns the inverse depth at the origin of the plane through points (squared distance, x, y, inverse
-/// depth), nearer ones counting more; level where they do not say how it is inclined.
+/// Returns the inverse depth at the origin of a plane through points (squared distance, x, y, inverse depth). Nearer
+/// points have more weight. The plane is level if the points do not determine its inclination.
 fn plane(points: &[(f32, f32, f32, f32)], unit: f64) -> f32 {
     let mut matrix = DMat3::from_diagonal(DVec3::new(0.0, 0.05, 0.05));
     let mut right = DVec3::ZERO;
@@ -101,27 +104,27 @@ fn plane(points: &[(f32, f32, f32, f32)], unit: f64) -> f32 {
     (matrix.inverse() * right).x as f32
 }
 
-/// Returns a place that some photo sees, with the colour that it has there.
+/// Returns a random place that some photo sees, with its colour in the photo.
 fn guess(dataset: &Dataset, extent: f32, random: &mut Random) -> (Vec3, [f32; 3]) {
     let Photo { view, target, .. } = &dataset.photos[random.below(dataset.photos.len())];
     let (x, y) = (random.below(view.width), random.below(view.height));
     let i = y * view.width + x;
     let z = match target.depth.get(i) {
         Some(&z) if z > 0.0 => z,
-        // As many at 1 to 2 as at 2 to 4.
+        // Logarithmic distribution: as many at 1 to 2 as at 2 to 4.
         _ => extent * 10f32.powf(random.within(-1.0, 0.5)),
     };
     let rgb = std::array::from_fn(|c| f32::from(target.rgb[3 * i + c]) / 255.0);
     (view.unproject([x as f32 + 0.5, y as f32 + 0.5], z), rgb)
 }
 
-/// Of a plane through what is known.
+/// Number of points that determine a plane.
 const NEIGHBOURS: usize = 8;
-/// Guesses across a photo.
+/// Grid cells across a photo.
 const GRID: usize = 20;
-/// Fewer points are no start.
+/// Minimum number of points; with fewer, random places are added.
 const MIN_POINTS: usize = 100;
-/// Of a Gaussian, in distances to its neighbours.
+/// Initial size of a Gaussian, in distances to its neighbours.
 const SIZE: f32 = 0.6;
 const OPACITY: f32 = 0.5;
 
@@ -133,10 +136,10 @@ mod tests {
     use vizflyt_protocol::geometry::{Intrinsics, Pose};
 
     #[test]
-    fn guesses_lie_on_the_plane_that_points_are_on() {
+    fn places_between_points_lie_on_their_plane() {
         let view =
             View::new(&Intrinsics::from_horizontal_fov(320, 240, 1.2), &Pose::IDENTITY, 0.01);
-        // y = 1.5, a floor below the camera, seen in a strip across its far end.
+        // y = 1.5: a floor below the camera, seen in a strip at its far end.
         let floor = |x: usize, y: usize| {
             let down = (y as f32 + 0.5 - view.center[1]) / view.focal[1];
             SeenPoint { pixel: (y * view.width + x) as u32, z: 1.5 / down }
@@ -149,7 +152,7 @@ mod tests {
         let places = between_points(&photo);
         let floor: Vec<_> = places.iter().filter(below).collect();
         assert!(floor.len() > 10, "{} guesses", floor.len());
-        // At the depth of the nearest points they would lie as low as 2.4.
+        // At the depth of the nearest points they would be as low as 2.4.
         for (p, _) in floor {
             assert!((p.y - 1.5).abs() < 0.4, "{p}");
         }

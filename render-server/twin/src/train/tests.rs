@@ -1,4 +1,4 @@
-//! Whether a device renders the rows that the host has, though it is told of the changed ones alone.
+//! A device must render the host's rows, although it receives only the changed ones.
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
@@ -9,7 +9,7 @@ use crate::loss::Target;
 use crate::render::{Renderer, tests};
 use crate::view::View;
 
-/// Six photos of some Gaussians.
+/// Returns six photos of some Gaussians.
 fn dataset() -> Dataset {
     let k = Intrinsics::from_horizontal_fov(64, 48, 1.2);
     let view = |x: f64| {
@@ -32,7 +32,7 @@ fn dataset() -> Dataset {
 }
 
 #[test]
-fn rows_that_changed_train_the_same_twin_as_all_rows() {
+fn uploading_only_changed_rows_trains_the_same_twin() {
     let Some(adapter) = Adapter::all().into_iter().next() else {
         println!("skipped: no graphics adapter; install mesa-vulkan-drivers and libvulkan1");
         return;
@@ -48,7 +48,7 @@ fn rows_that_changed_train_the_same_twin_as_all_rows() {
                 trainer.stale = None;
             }
             trainer.step();
-            // Images in between, of other photos; after a move, too.
+            // Images of other photos in between, also directly after a relocation.
             if trainer.steps().is_multiple_of(25) {
                 judged.push(trainer.judge().map(|quality| quality.psnr_db.to_bits()));
             }

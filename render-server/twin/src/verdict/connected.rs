@@ -1,10 +1,10 @@
-//! What holds the walk together: points that images share. Two parts that few points join may lie anywhere to each
-//! other, and bundle adjustment is content.
+//! Connection check: images must share points. Two parts joined by few points may have any relative pose, and bundle
+//! adjustment does not report it.
 
 use super::walk::Walk;
 use super::{Check, Finding, Severity, Verdict};
 
-/// How many points each two images share.
+/// Number of points that each pair of images shares.
 pub(super) struct Shared {
     images: usize,
     counts: Vec<u32>,
@@ -30,7 +30,7 @@ impl Shared {
     }
 }
 
-/// Returns which images saw each point, each once, ascending.
+/// Returns the images that saw each point, without duplicates, in ascending order.
 fn by_point(walk: &Walk<'_>) -> Vec<Vec<usize>> {
     let mut seen = vec![Vec::new(); walk.points.len()];
     for (image, one) in walk.evidence.capture.images.iter().enumerate() {
@@ -43,7 +43,7 @@ fn by_point(walk: &Walk<'_>) -> Vec<Vec<usize>> {
     seen
 }
 
-/// Adds the weakest joint, if it is weak.
+/// Adds a finding if the weakest joint is weak.
 pub(super) fn check(walk: &Walk<'_>, shared: &Shared, verdict: &mut Verdict) {
     let images = shared.images;
     let least = (images / 20).max(PART);
@@ -78,7 +78,7 @@ pub(super) fn check(walk: &Walk<'_>, shared: &Shared, verdict: &mut Verdict) {
         severity,
         check: Check::Connected,
         what: format!(
-            "{count} images hang on the other {} by {joined} points alone: {}",
+            "only {joined} points connect {count} images with the other {}: {}",
             images - count,
             walk.spans(&runs)
         ),
@@ -88,8 +88,8 @@ pub(super) fn check(walk: &Walk<'_>, shared: &Shared, verdict: &mut Verdict) {
     });
 }
 
-/// Returns which images are on one side of the weakest joint, with at least so many on either: the joint that is last
-/// made when images are joined by most points first (J. Kruskal 1956).
+/// Returns the images on one side of the weakest joint with at least `least` images on either side. This is the last
+/// joint made if images with the most common points are joined first (J. Kruskal 1956).
 fn weakest(shared: &Shared, least: usize) -> Option<Vec<bool>> {
     let images = shared.images;
     let mut pairs: Vec<(u32, usize, usize)> = (0..images)
@@ -113,9 +113,9 @@ fn weakest(shared: &Shared, least: usize) -> Option<Vec<bool>> {
     weakest
 }
 
-/// Fewer images are not a part.
+/// Minimum number of images of a part.
 const PART: usize = 3;
-/// Three points fix a similarity; of several times as many, outliers among them, it is known well.
+/// Limit for refusal. Three points fix a similarity transform; several times as many fix it well despite outliers.
 const FEW: usize = 20;
-/// Known, though not as well as within the parts.
+/// Limit for a warning: the joint is known, but less well than the parts themselves.
 const SOME: usize = 60;

@@ -1,14 +1,14 @@
-//! The way from image to image: a hand that films neither leaps nor spins.
+//! Continuity check: a hand-held camera neither leaps nor spins between images.
 //!
-//! Each step between two images that follow each other is a speed and a rate of turn. What is far beyond the others'
-//! is no step: one of the two images, or all that follow, is in the wrong place. That needs no scale.
+//! Each step between consecutive images has a speed and a rotation rate. A value far above the usual one means that one
+//! of the two images, or all following ones, have a wrong pose. The check needs no scale.
 
 use super::walk::Walk;
 use super::{Check, Finding, Severity, Verdict};
 
-/// A step of the walk.
+/// A step between two consecutive images.
 struct WalkStep {
-    /// The image it leads to; the one before comes from.
+    /// Index of the second image.
     to: usize,
     speed: f64,
     turn_radps: f64,
@@ -16,7 +16,7 @@ struct WalkStep {
     turn_rad: f64,
 }
 
-/// Adds leaps and spins: of the walk as structure from motion left it, and if that has none, as tags have bent it.
+/// Adds leaps and spins: first of structure from motion's poses; if those have none, of the adjusted poses.
 pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
     let as_found = walk.as_found();
     if !check_one(&as_found, verdict) && walk.evidence.adjusted.is_ok() {
@@ -25,7 +25,7 @@ pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
     }
 }
 
-/// Returns whether it found any.
+/// Returns whether there were findings.
 fn check_one(walk: &Walk<'_>, verdict: &mut Verdict) -> bool {
     let before = verdict.findings.len();
     leaps(walk, verdict);
@@ -34,8 +34,8 @@ fn check_one(walk: &Walk<'_>, verdict: &mut Verdict) -> bool {
 
 fn leaps(walk: &Walk<'_>, verdict: &mut Verdict) {
     if walk.given().iter().all(|given| given.at_s.is_none()) {
-        // Photos are taken wherever one stands, and are sorted by name.
-        verdict.checked.push("continuity: not looked at, photos have no times".to_owned());
+        // Photos are taken anywhere and are sorted by name.
+        verdict.checked.push("continuity: not checked, photos have no times".to_owned());
         return;
     }
     let steps = steps(walk);
@@ -89,7 +89,7 @@ fn leaps(walk: &Walk<'_>, verdict: &mut Verdict) {
     verdict.findings.push(Finding {
         severity: Severity::Refused,
         check: Check::Continuity,
-        what: format!("the walk leaps where no hand can: {}{more}", told.join("; ")),
+        what: format!("the path of the camera has impossible jumps: {}{more}", told.join("; ")),
         remedy: format!(
             "film that part again in one go, slowly, with more of what is particular to the place in view: {when}"
         ),
@@ -97,7 +97,8 @@ fn leaps(walk: &Walk<'_>, verdict: &mut Verdict) {
     });
 }
 
-/// Adds steps that no step around them is like: a model that came apart and was put together again a little off.
+/// Warns about steps much longer than their neighbours: a model that came apart and was joined again with a small
+/// error.
 fn stands_out(walk: &Walk<'_>, steps: &[WalkStep], usual_speed: f64, verdict: &mut Verdict) {
     let alone: Vec<&WalkStep> = steps
         .windows(3)
@@ -115,7 +116,8 @@ fn stands_out(walk: &Walk<'_>, steps: &[WalkStep], usual_speed: f64, verdict: &m
         severity: Severity::Warning,
         check: Check::Continuity,
         what: format!("a step is much longer than those around it: {}", walk.spans(&images)),
-        remedy: "if nobody stepped out there, the walk was torn and joined again: film that part again, slowly"
+        remedy: "if you did not take a longer step there, the model was split and joined again: film that part again, \
+                 slowly"
             .to_owned(),
         images,
     });
@@ -140,26 +142,26 @@ fn steps(walk: &Walk<'_>) -> Vec<WalkStep> {
         .collect()
 }
 
-/// Returns the value that a share of the values is below.
+/// Returns a quantile.
 fn quantile(values: impl Iterator<Item = f64>, share: f64) -> f64 {
     let mut sorted: Vec<f64> = values.collect();
     sorted.sort_by(f64::total_cmp);
     sorted[((sorted.len() - 1) as f64 * share) as usize]
 }
 
-/// Fewer steps have no usual speed.
+/// Minimum number of steps that determine a usual speed.
 const FEW: usize = 6;
-/// A walk that stops to look around has half of its steps short.
+/// Quantile of the usual speed: in a walk with stops to look around, half of the steps are short.
 const USUAL: f64 = 0.75;
-/// Beyond so many times the usual speed is no step.
+/// Maximum ratio to the usual speed.
 const TIMES: f64 = 4.0;
-/// A step that is none of one's gait.
+/// Maximum ratio to the speed of the neighbouring steps.
 const ALONE: f64 = 1.6;
-/// Whoever films slowly may still take a quick step. [m/s]
+/// Minimum speed of a leap: people who film slowly may still take a quick step. [m/s]
 const LEAST_LEAP_MPS: f64 = 1.5;
-/// Nobody films at a run. [m/s]
+/// Maximum speed: people do not film while running. [m/s]
 const MOST_MPS: f64 = 5.0;
-/// A hand turns a phone so fast that nothing is sharp. [rad/s]
+/// Minimum rate of a spin: faster rotation blurs all images. [rad/s]
 const LEAST_SPIN_RADPS: f64 = 2.5;
-/// More than this nobody reads.
+/// Maximum number of leaps in a message.
 const TOLD: usize = 3;

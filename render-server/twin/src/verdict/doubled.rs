@@ -1,8 +1,9 @@
-//! One place that is two: images whose poses show them one surface from the same side, and that share no point of it.
+//! Check for doubled places: images whose poses show the same surface from the same side, but that share no points of
+//! it.
 //!
-//! Where two rooms that look alike have been put on one another, images of the one find the points of the other just
-//! where they should be: but what differs between the rooms is there twice, side by side, and images of the same wall
-//! from the same place have nothing in common.
+//! If two rooms that look alike were merged, images of one find the points of the other where expected. But differences
+//! between the rooms then exist twice, side by side, and images of the same wall from the same position have nothing in
+//! common.
 
 use glam::DVec2;
 
@@ -10,7 +11,7 @@ use super::connected::Shared;
 use super::walk::Walk;
 use super::{Check, Finding, Severity, Verdict};
 
-/// Adds pairs of images that should share points and do not.
+/// Adds a finding if many pairs of images should share points and do not.
 pub(super) fn check(walk: &Walk<'_>, shared: &Shared, verdict: &mut Verdict) {
     let images = walk.poses.len();
     let seen: Vec<Surface> = (0..images).map(|image| Surface::of(walk, image)).collect();
@@ -41,22 +42,22 @@ pub(super) fn check(walk: &Walk<'_>, shared: &Shared, verdict: &mut Verdict) {
         severity: Severity::Refused,
         check: Check::Doubled,
         what: format!(
-            "two places that look alike seem to have been put on one another: {} of {should} pairs of images see the \
+            "two places that look alike seem to have been merged: {} of {should} pairs of images see the \
              same from the same side, and have nothing in common: {}",
             do_not.len(),
             walk.spans(&runs)
         ),
-        remedy: "put something different into each of the places, such as tags; film both again, and the way between \
+        remedy: "put something different into each of the places, such as tags; film both again, and the path between \
                  them in one go"
             .to_owned(),
         images: runs,
     });
 }
 
-/// What an image saw: points with the direction and distance that it saw them from.
+/// Points that an image saw, with their depth.
 struct Surface {
     image: usize,
-    /// (point, pixel, depth), and the nearest of a raster's cell.
+    /// (point, pixel, depth).
     seen: Vec<(usize, DVec2, f64)>,
     columns: usize,
     cells: Vec<Vec<usize>>,
@@ -85,8 +86,8 @@ impl Surface {
         surface
     }
 
-    /// Returns how many of its points another image should see: where that has points at the same depth, and looks from
-    /// about the same side and distance.
+    /// Returns the number of own points that another image should see: where that image has points at the same depth,
+    /// and a similar direction and distance.
     fn agrees_with(&self, walk: &Walk<'_>, other: &Self, b: usize) -> u32 {
         if self.image == b {
             return 0;
@@ -118,17 +119,17 @@ impl Surface {
     }
 }
 
-/// Columns of the raster in which neighbours are looked for.
+/// Number of columns of the raster for the search of neighbours.
 const CELLS: f64 = 32.0;
-/// Surfaces agree within this share of their depth.
+/// Maximum relative difference in depth of the same surface.
 const DEPTH: f64 = 0.03;
-/// Features are found again from 20 degrees aside.
+/// Maximum change of direction in which features are still matched, cos(20 degrees).
 const SIDE_COS: f64 = 0.94;
-/// And from half as far again.
+/// Maximum ratio of distances in which features are still matched.
 const DISTANCE: f64 = 1.4;
-/// So many points of one image where the other has surface too.
+/// Minimum number of points of one image where the other also has surface.
 const SHOULD: u32 = 30;
-/// Of these, images of one place share some fifth or more.
+/// Limit of the shared fraction; images of one place share about a fifth or more.
 const NONE: f64 = 0.02;
-/// In captures that are right some pairs share nothing as well: repeated texture, blur.
+/// Limit of the fraction of such pairs. In correct captures, repeated texture and blur also cause some.
 const MANY: f64 = 0.15;

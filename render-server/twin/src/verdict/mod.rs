@@ -1,8 +1,8 @@
-//! Whether a capture can be flown: checks that do not believe structure from motion.
+//! Verdict about a capture: checks that do not rely on structure from motion's own residuals.
 //!
-//! "All images placed, 0.4 pixels" is said of models that are metres wrong. What is looked at here is what such a model
-//! cannot fake: how a hand can move between two images, tags that had no say, what a second model says, how many points
-//! hold the parts of a walk together, and what should be seen and is not.
+//! "All images placed, 0.4 pixels" is also reported for models with errors of metres. The checks use evidence that such
+//! a model cannot fake: possible motion of a hand between two images, held-out tags, a second model, the number of
+//! points that connect the parts of a walk, and points that should be visible but are not.
 
 mod connected;
 mod continuity;
@@ -19,84 +19,83 @@ use std::ops::Range;
 use crate::adjust::{Adjusted, Capture};
 use crate::align::Fit;
 
-/// What is judged.
+/// Input of the verdict.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence<'a> {
-    /// Every image that was given to structure from motion, in the order of time.
+    /// All images given to structure from motion, in the order of time.
     pub given: &'a [Given],
-    /// Those that were placed.
+    /// Images with poses.
     pub capture: &'a Capture,
-    /// The same in metres; `Err` says why it could not be.
+    /// The adjusted capture in metres; `Err` is the reason why it could not be adjusted.
     pub adjusted: Result<&'a Adjusted, &'a crate::adjust::AdjustError>,
-    /// Other models of the same images: further ones that structure from motion left, or another program's.
+    /// Other models of the same images: further models of structure from motion, or of another program.
     pub others: &'a [Capture],
-    /// Where a person has aligned it, which tells scale and vertical where nothing in the capture does.
+    /// Manual alignment, which gives scale and vertical if the capture does not determine them.
     pub aligned: Option<&'a Fit>,
 }
 
-/// An image that was given to structure from motion.
+/// An image given to structure from motion.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Given {
-    /// Its file's name.
+    /// File name.
     pub name: String,
-    /// When it was taken, from the start of the video; photos have no times. [s]
+    /// Time from the start of the video; `None` for photos. [s]
     pub at_s: Option<f64>,
 }
 
-/// What came out.
+/// Result of the checks.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Verdict {
-    /// What was found, the worst first; empty if all is well.
+    /// Findings, the worst first; empty if there are none.
     pub findings: Vec<Finding>,
-    /// What was looked at, a line each, with its figure: for a report.
+    /// Results of all checks, one line each with its figure, for a report.
     pub checked: Vec<String>,
 }
 
-/// Something that a person should know.
+/// A problem of a capture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Finding {
-    /// How bad it is.
     pub severity: Severity,
-    /// Which check found it.
+    /// Check that found it.
     pub check: Check,
-    /// What is wrong, with its figure.
+    /// Problem, with its figure.
     pub what: String,
-    /// What to film again, or to do.
+    /// Remedy: what to film again, or to do.
     pub remedy: String,
-    /// Runs of the images concerned, as they were given.
+    /// Ranges of the images concerned, as indices into the given images.
     pub images: Vec<Range<usize>>,
 }
 
-/// How bad something is.
+/// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
-    /// Not to be flown.
+    /// The capture must not be flown.
     Refused,
-    /// To be known.
+    /// The capture may be flown.
     Warning,
 }
 
-/// What was looked at.
+/// Kind of check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Check {
-    /// Scale, vertical, and how well they are known.
+    /// Accuracy of scale and vertical.
     Metric,
-    /// Tags against the images.
+    /// Agreement of tags with the images.
     Tags,
-    /// The way from image to image.
+    /// Continuity of the path from image to image.
     Continuity,
-    /// Images without a place.
+    /// Images without a pose.
     Placed,
-    /// What holds the parts together.
+    /// Connection of the parts.
     Connected,
-    /// One place that is two.
+    /// One place that consists of two.
     Doubled,
-    /// What other models say.
+    /// Agreement with other models.
     SecondModel,
 }
 
 impl Verdict {
-    /// Whether it may be flown.
+    /// Returns whether the capture may be flown.
     pub fn is_fit_to_fly(&self) -> bool {
         self.findings.iter().all(|finding| finding.severity != Severity::Refused)
     }

@@ -1,10 +1,10 @@
-//! Images without a place: where in the walk, and whether that is much.
+//! Check for images without a pose.
 
 use std::collections::HashSet;
 
 use super::{Check, Evidence, Finding, Severity, Verdict, words};
 
-/// Adds what is missing.
+/// Adds the missing images.
 pub(super) fn check(evidence: &Evidence<'_>, verdict: &mut Verdict) {
     let placed: HashSet<&str> =
         evidence.capture.images.iter().map(|image| image.name.as_str()).collect();
@@ -27,12 +27,12 @@ pub(super) fn check(evidence: &Evidence<'_>, verdict: &mut Verdict) {
         severity,
         check: Check::Placed,
         what: format!("{} of {given} images were not placed: {spans}", missing.len()),
-        remedy: "walk there again, slowly, with more than half of the last image still in view; nothing is known of \
-                 what these images alone saw"
+        remedy: "walk there again, slowly, with more than half of the last image still in view; the parts that \
+                 only these images saw are missing"
             .to_owned(),
         images,
     });
 }
 
-/// With one image in ten missing, whole parts of a room are.
+/// Minimum fraction of placed images: with one image in ten missing, whole parts of a room are missing.
 const LEAST_PLACED: f64 = 0.9;

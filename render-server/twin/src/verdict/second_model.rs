@@ -1,4 +1,4 @@
-//! What other models of the same images say: where two programs, or two runs of one, disagree, one is wrong.
+//! Comparison with other models of the same images: if two programs, or two runs of one, disagree, one is wrong.
 
 use std::collections::HashMap;
 
@@ -6,7 +6,7 @@ use super::walk::Walk;
 use super::{Check, Finding, Severity, Verdict};
 use crate::align::points::{self, Pair};
 
-/// Adds where other models disagree.
+/// Adds disagreements with other models.
 pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
     for (number, other) in walk.evidence.others.iter().enumerate() {
         let number = number + 2;
@@ -18,7 +18,7 @@ pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
             .enumerate()
             .map(|(index, image)| (image.name.as_str(), index))
             .collect();
-        // (image here, its pair of places, how much it is turned there).
+        // (image index, pair of positions).
         let common: Vec<(usize, Pair)> = other
             .images
             .iter()
@@ -54,7 +54,7 @@ pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
         };
         let share = wrong.len() as f64 / common.len() as f64;
         verdict.checked.push(format!(
-            "model {number}: {} images, {} of them in the first, of which {} are elsewhere",
+            "model {number}: {} images, {} of them in the first, of which {} have other positions",
             other.images.len(),
             common.len(),
             wrong.len()
@@ -68,12 +68,12 @@ pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
             severity,
             check: Check::SecondModel,
             what: format!(
-                "another model of the same images has {} of {} somewhere else: {}",
+                "another model of the same images has other positions for {} of {} images: {}",
                 wrong.len(),
                 common.len(),
                 walk.spans(&runs)
             ),
-            remedy: "one of the two is wrong, and nothing says which; film that part again, slowly, with more of what \
+            remedy: "one of the two is wrong, and it is unknown which; film that part again, slowly, with more of what \
                      is particular to the place in view"
                 .to_owned(),
             images: runs,
@@ -81,9 +81,9 @@ pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
     }
 }
 
-/// Fewer say nothing: three of them fix a similarity.
+/// Minimum number of common images: three fix a similarity transform.
 const FEW: usize = 6;
-/// Of the spread of the walk: models of one walk agree within a hundredth.
+/// Maximum difference relative to the spread of the walk; models of one walk agree within 1 %.
 const DISAGREES: f64 = 0.04;
-/// One image in twenty may be off in one model alone.
+/// Limit for refusal: one image in twenty may be wrong in only one model.
 const MANY: f64 = 0.05;

@@ -1,4 +1,4 @@
-//! Tags against the images: a tag stands in one place, and where others say it is.
+//! Check of tags: each has one position, which agrees with the images and with the other tags.
 
 use glam::{DVec2, DVec3};
 
@@ -7,7 +7,7 @@ use super::{Check, Finding, Severity, Verdict};
 use crate::adjust::{Adjusted, TagResult};
 use crate::align::corners::Ray;
 
-/// Adds tags that contradict the images, or each other.
+/// Adds tags that contradict the images or each other.
 pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
     let Ok(adjusted) = walk.evidence.adjusted else { return };
     let tags = &walk.evidence.capture.tags;
@@ -57,7 +57,7 @@ fn somewhere_else(walk: &Walk<'_>, tag: usize, result: &TagResult, verdict: &mut
     add(walk, verdict, &[tag], &what, remedy);
 }
 
-/// Rays that should meet and do not.
+/// Adds a finding if a tag's rays do not meet although they should.
 fn nowhere(walk: &Walk<'_>, tag: usize, verdict: &mut Verdict) {
     let images = images_of(walk, tag);
     let rays: Vec<Ray> = images
@@ -87,7 +87,7 @@ fn nowhere(walk: &Walk<'_>, tag: usize, verdict: &mut Verdict) {
     }
     let name = &walk.evidence.capture.tags[tag].name;
     let what = format!(
-        "{name} is nowhere: the {} images that show it point to different places",
+        "{name} has no position: the {} images that show it point to different places",
         images.len()
     );
     let remedy = "look for another tag of the same number; if there is none, these images are in the wrong place: \
@@ -95,7 +95,7 @@ fn nowhere(walk: &Walk<'_>, tag: usize, verdict: &mut Verdict) {
     add(walk, verdict, &[tag], &what, remedy);
 }
 
-/// Whether two rays pass each other by, or would have met behind a camera; `None` of rays too parallel to tell.
+/// Returns whether two rays miss each other, or would meet behind a camera; `None` if they are too parallel.
 fn passes_by(a: &Ray, b: &Ray) -> Option<bool> {
     let across = a.direction.cross(b.direction);
     let sine2 = across.length_squared();
@@ -103,7 +103,7 @@ fn passes_by(a: &Ray, b: &Ray) -> Option<bool> {
         return None;
     }
     let between = b.origin - a.origin;
-    // How far along each is nearest to the other.
+    // Distance along each ray at which it is nearest to the other.
     let along_a = between.cross(b.direction).dot(across) / sine2;
     let along_b = between.cross(a.direction).dot(across) / sine2;
     let apart = between.dot(across).abs() / sine2.sqrt();
@@ -139,7 +139,7 @@ fn held_out(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
             100.0 * off_m.iter().copied().fold(0.0, f64::max)
         );
         let is_off = |held: &crate::adjust::HeldOut| held.off_m.is_some_and(|m| m > MOST_OFF_M);
-        // Seen flat, seldom or from one side, rays meet far from where they should.
+        // Rays to a tag seen at a flat angle, seldom, or from one side meet far from its true position.
         let is_wrong = |held: &crate::adjust::HeldOut| {
             let doubt_m = (DOUBT_PX * held.by_pixel_m).min(MOST_DOUBT_M);
             is_off(held) && held.rms_px > MOST_OFF_PX && held.off_m.is_some_and(|m| m > doubt_m)
@@ -150,7 +150,7 @@ fn held_out(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
             .collect();
         if !unclear.is_empty() {
             verdict.checked.push(format!(
-                "tags held out: {} were seen too seldom, or from too few sides, to say where they stand",
+                "tags held out: {} were seen too seldom, or from too few sides, to determine their positions",
                 unclear.join(", ")
             ));
         }
@@ -175,13 +175,13 @@ fn held_out(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
     }
     let names: Vec<&str> =
         wrong.iter().map(|tag| walk.evidence.capture.tags[*tag].name.as_str()).collect();
-    let what = format!("{line}; {} are where the others do not have them", names.join(", "));
+    let what = format!("{line}; {} contradict the other tags", names.join(", "));
     let remedy = "measure again where these tags stand; if that is right, the images around them are in the wrong \
                   place: film there again, each tag from several sides";
     add(walk, verdict, &wrong, &what, remedy);
 }
 
-/// Two tags that stand in each other.
+/// Adds a finding for each two tags at the same position.
 fn in_one_place(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
     let tags = &walk.evidence.capture.tags;
     let found: Vec<(usize, DVec3)> = adjusted
@@ -195,7 +195,7 @@ fn in_one_place(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
             let size_m = tags[a].size_m.min(tags[b].size_m);
             if at_a.distance(at_b) < ONE_PLACE * size_m {
                 let what = format!("{} and {} are in one place", tags[a].name, tags[b].name);
-                let remedy = "two places that look alike were put on one another; film both again, and the way from one to \
+                let remedy = "two places that look alike were merged; film both again, and the path from one to \
                               the other in one go, with what differs between them in view";
                 add(walk, verdict, &[a, b], &what, remedy);
             }
@@ -203,26 +203,26 @@ fn in_one_place(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
     }
 }
 
-/// A misread tag is one image's.
+/// Minimum number of contradicting images; a misread tag occurs in one image.
 const CONTRADICTING: usize = 3;
-/// And few of them.
+/// Minimum fraction of contradicting images.
 const SHARE: f64 = 0.25;
-/// Five degrees: rays that are more parallel do not say where they meet. [rad]
+/// Minimum sine of the angle between rays, five degrees: more parallel rays do not determine an intersection.
 const PARALLEL: f64 = 0.09;
-/// Of the distance: poses of a good capture are known ten times better. [rad]
+/// Maximum distance between rays relative to their length; poses of good captures are ten times more accurate.
 const PASSES_BY: f64 = 0.05;
-/// Beyond this a tag and the images around it contradict each other; good captures have a few centimetres. [m]
+/// Maximum error of a held-out tag; good captures have a few centimetres. [m]
 const MOST_OFF_M: f64 = 0.15;
-/// And beyond this images see them elsewhere: what blur and a rolling shutter do to corners is less; a tag that is 15 cm off
-/// is 20 px off at 4 m. [px]
+/// Maximum reprojection error of a held-out tag: blur and rolling shutter cause less; a tag that is 15 cm off is 20 px
+/// off at 4 m. [px]
 const MOST_OFF_PX: f64 = 4.0;
-/// Corners, and the poses around a tag that had no say, are off by this together. [px]
+/// Assumed combined error of corners and of the poses around a held-out tag. [px]
 const DOUBT_PX: f64 = 4.0;
-/// And no doubt excuses more. [m]
+/// Maximum tolerated position error by such uncertainty. [m]
 const MOST_DOUBT_M: f64 = 0.4;
-/// Beyond this an edge is not what it was printed as.
+/// Maximum relative error of a tag's edge length.
 const MOST_SIZE: f64 = 0.1;
-/// White bleeds into black by a tenth or two, in images of our own captures. [px]
+/// Maximum inset; in images of our own captures, white bleeds into black by 0.1 to 0.2. [px]
 const MOST_INSET_PX: f64 = 0.6;
-/// Of an edge: no two tags hang closer together.
+/// Minimum distance of two tags, in edge lengths.
 const ONE_PLACE: f64 = 0.7;

@@ -1,4 +1,4 @@
-//! A synthetic hall that is judged as it is, and with a mistake of a known kind put in.
+//! Verdicts about a synthetic hall: correct, and with known kinds of errors.
 
 use glam::{DQuat, DVec3};
 use proptest::prelude::*;
@@ -8,7 +8,7 @@ use super::*;
 use crate::adjust::synthetic::{Hall, hall};
 use crate::adjust::{Options, TagSighting, adjust};
 
-/// A walk of 40 images.
+/// Returns a walk of 40 images.
 fn good(seed: u64) -> Hall {
     hall(seed, 40, 2400, 0.4).found(seed + 77, 0.01)
 }
@@ -38,7 +38,7 @@ fn refused(verdict: &Verdict, check: Check) -> &Finding {
     found
 }
 
-/// Moves images, as found, with a map of `scene`; points that others see too stay.
+/// Moves images by a transform in `scene`; points that other images also see stay.
 fn move_images(
     capture: &mut Capture,
     images: Range<usize>,
@@ -54,7 +54,7 @@ fn move_images(
         .collect();
     let mut own = std::collections::BTreeSet::new();
     for image in &mut capture.images[images] {
-        // What joined the two parts is what structure from motion has thrown out.
+        // Structure from motion would reject the points that joined the two parts.
         image.seen.retain(|seen| !outside.contains(&seen.point));
         own.extend(image.seen.iter().map(|seen| seen.point));
         let pose = image.scene_from_cam;
@@ -67,18 +67,18 @@ fn move_images(
 }
 
 proptest! {
-    // What contradicts itself is adjusted for long.
+    // Contradictory captures take long to adjust.
     #![proptest_config(ProptestConfig::with_cases(1))]
 
     #[test]
-    fn a_half_that_was_turned_onto_the_other_is_found(seed in 0..1000u64) {
+    fn detects_a_half_rotated_onto_the_other(seed in 0..1000u64) {
         let mut hall = good(seed);
-        // A half turn about the vertical through the hall's middle, in the frame as found.
+        // Half a turn about the vertical through the hall's centre, in structure from motion's frame.
         let turn = DQuat::from_scaled_axis(DVec3::new(1.1, -0.4, 2.0));
         let about = turn * DQuat::from_rotation_z(std::f64::consts::PI) * turn.conjugate();
         let middle = DVec3::new(3.0, -1.0, 0.5);
         move_images(&mut hall.capture, 10..30, |p| middle + about * (p - middle), about);
-        // Once, for film and photos.
+        // Adjust once for film and photos.
         let adjusted = adjust(&hall.capture, Options::default());
         let judged = |given: &[Given]| {
             let (capture, adjusted) = (&hall.capture, adjusted.as_ref());
@@ -97,7 +97,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(3))]
 
     #[test]
-    fn a_proper_walk_may_be_flown(seed in 0..1000u64) {
+    fn accepts_a_correct_walk(seed in 0..1000u64) {
         let hall = good(seed);
         let verdict = judged(&given(&hall), &hall.capture, std::slice::from_ref(&hall.capture));
         prop_assert!(verdict.findings.is_empty(), "{verdict:#?}");
@@ -105,7 +105,7 @@ proptest! {
     }
 
     #[test]
-    fn a_part_that_jumped_is_found(seed in 0..1000u64, first in 5..25usize, far in 4.0..20.0f64) {
+    fn detects_a_displaced_part(seed in 0..1000u64, first in 5..25usize, far in 4.0..20.0f64) {
         let mut hall = good(seed);
         // 1 m is 0.37 units.
         let by = DVec3::new(0.37 * far, 0.0, 0.0);
@@ -114,15 +114,15 @@ proptest! {
         let found = refused(&verdict, Check::Continuity);
         prop_assert!(found.images.iter().any(|run| run.contains(&first)), "{found:?}");
         refused(&verdict, Check::Connected);
-        // Of photos nobody knows how soon one followed the other: what they share tells it all the same.
+        // Photos have no times, but the shared points still reveal the jump.
         let verdict = judged(&photos(&hall), &hall.capture, &[]);
         prop_assert!(!verdict.findings.iter().any(|f| f.check == Check::Continuity), "{verdict:#?}");
         let found = refused(&verdict, Check::Connected);
-        prop_assert!(!found.what.contains(" s)"), "no time is made up: {}", found.what);
+        prop_assert!(!found.what.contains(" s)"), "the message has a time: {}", found.what);
     }
 
     #[test]
-    fn a_tag_that_is_elsewhere_is_named(seed in 0..1000u64, tag in 0..12usize, off_m in 0.3..2.0f64) {
+    fn names_a_displaced_tag(seed in 0..1000u64, tag in 0..12usize, off_m in 0.3..2.0f64) {
         let mut hall = good(seed);
         for corner in hall.capture.tags[tag].corners_m.as_mut().unwrap() {
             corner.z += off_m;
@@ -134,7 +134,7 @@ proptest! {
     }
 
     #[test]
-    fn two_tags_of_one_number_are_found(seed in 0..1000u64, with in 3..10usize) {
+    fn detects_two_tags_with_one_number(seed in 0..1000u64, with in 3..10usize) {
         let mut hall = good(seed);
         for image in &mut hall.capture.images {
             for seen in &mut image.tags {
@@ -148,7 +148,7 @@ proptest! {
     }
 
     #[test]
-    fn prints_of_another_size_are_found(seed in 0..1000u64, size in prop_oneof![0.85..0.95f64, 1.06..1.2f64]) {
+    fn detects_wrong_print_sizes(seed in 0..1000u64, size in prop_oneof![0.85..0.95f64, 1.06..1.2f64]) {
         let mut hall = good(seed);
         for tag in &mut hall.capture.tags {
             tag.size_m *= size;
@@ -162,10 +162,10 @@ proptest! {
     }
 }
 
-/// A tag that three images see from one side, blurred: by their rays it stands elsewhere, though each sees it where it
-/// stands, to two pixels.
+/// A tag seen by only three images from one side, with blur: its rays meet elsewhere, although each image sees it
+/// within two pixels of its position.
 #[test]
-fn a_tag_that_few_images_see_badly_refuses_nothing() {
+fn accepts_a_tag_seen_badly_by_few_images() {
     for seed in [8, 9, 10] {
         let mut hall = good(seed);
         let sees = |hall: &Hall, tag| -> Vec<usize> {
@@ -191,9 +191,9 @@ fn a_tag_that_few_images_see_badly_refuses_nothing() {
     }
 }
 
-/// Two centimetres, near by: more pixels than any corner is found wrong by, and no other place.
+/// 2.5 cm at short distance: more pixels than any detection error, but not another position.
 #[test]
-fn a_tag_that_was_measured_a_little_wrong_is_in_its_place() {
+fn accepts_a_slightly_wrong_tag_measurement() {
     let mut hall = good(11);
     for corner in hall.capture.tags[3].corners_m.as_mut().unwrap() {
         corner.z += 0.025;
@@ -203,13 +203,13 @@ fn a_tag_that_was_measured_a_little_wrong_is_in_its_place() {
 }
 
 #[test]
-fn without_tags_it_has_no_metres() {
+fn scale_is_unknown_without_tags() {
     let mut hall = good(3);
     hall.capture.tags.clear();
     hall.capture.images.iter_mut().for_each(|image| image.tags.clear());
     let verdict = judged(&given(&hall), &hall.capture, &[]);
-    assert!(refused(&verdict, Check::Metric).what.contains("no metres"), "{verdict:?}");
-    // Unless a person has aligned it.
+    assert!(refused(&verdict, Check::Metric).what.contains("scale is unknown"), "{verdict:?}");
+    // A manual alignment gives the scale.
     let adjusted = adjust(&hall.capture, Options::default()).unwrap();
     let fit = Fit {
         world_from_scene: adjusted.world_from_scene,
@@ -231,7 +231,7 @@ fn without_tags_it_has_no_metres() {
 }
 
 #[test]
-fn what_was_not_placed_is_said_with_its_time() {
+fn reports_unplaced_images_with_their_times() {
     let mut hall = good(4);
     let all = given(&hall);
     hall.capture.images.drain(20..23);
@@ -248,7 +248,7 @@ fn what_was_not_placed_is_said_with_its_time() {
 }
 
 #[test]
-fn a_second_model_that_disagrees_is_told() {
+fn reports_a_disagreeing_second_model() {
     let hall = good(5);
     let mut other = hall.capture.clone();
     for image in &mut other.images[25..32] {
@@ -259,9 +259,9 @@ fn a_second_model_that_disagrees_is_told() {
 }
 
 #[test]
-fn few_points_that_join_two_parts_are_told() {
+fn reports_parts_joined_by_few_points() {
     let mut hall = good(6);
-    // Between 10 and 25 and the rest only a dozen points stay common.
+    // Only a dozen points connect images 10 to 25 with the rest.
     let inside: std::collections::HashSet<usize> =
         hall.capture.images[10..25].iter().flat_map(|i| i.seen.iter().map(|s| s.point)).collect();
     let outside = hall.capture.images[..10].iter().chain(&hall.capture.images[25..]);
@@ -280,9 +280,9 @@ fn few_points_that_join_two_parts_are_told() {
 }
 
 #[test]
-fn a_room_put_on_its_likeness_is_found_by_what_it_does_not_share() {
+fn detects_two_similar_rooms_merged_into_one() {
     let mut hall = good(7);
-    // Every second image is of another room: its points stand a hand's breadth beside those of the first.
+    // Every second image shows another room: its points are about 1 cm away from those of the first.
     let count = hall.capture.points.len();
     let mut random = crate::random::Random::new(9);
     let copies: Vec<DVec3> = hall

@@ -1,4 +1,4 @@
-//! The walk as it was placed: by the adjustment, or as structure from motion left it.
+//! Poses of a walk: adjusted, or those of structure from motion.
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -8,15 +8,15 @@ use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 
 use super::{Evidence, Given, words};
 
-/// Poses and points in one frame, and which image is which.
+/// Poses and points in one frame, with the indices of the images.
 pub(super) struct Walk<'a> {
     pub(super) evidence: &'a Evidence<'a>,
     pub(super) lens: Intrinsics,
     pub(super) poses: Vec<Pose<World, Cam>>,
     pub(super) points: &'a [DVec3],
-    /// Which of the given images each is.
+    /// Index of each image in the given images.
     pub(super) index: Vec<usize>,
-    /// Whether lengths are metres.
+    /// Lengths are in metres.
     pub(super) is_metric: bool,
 }
 
@@ -29,7 +29,7 @@ impl<'a> Walk<'a> {
             .enumerate()
             .map(|(index, given)| (given.name.as_str(), index))
             .collect();
-        // One that was never given stands after all others.
+        // An unknown image gets an index after all others.
         let find = |name: &str| number.get(name).copied().unwrap_or(evidence.given.len());
         let index = capture.images.iter().map(|image| find(&image.name)).collect();
         match evidence.adjusted {
@@ -52,7 +52,7 @@ impl<'a> Walk<'a> {
         }
     }
 
-    /// Returns it as structure from motion left it, in metres if they are known.
+    /// Returns the walk with structure from motion's poses, in metres if the scale is known.
     pub(super) fn as_found(&self) -> Self {
         let evidence = self.evidence;
         let scale = match evidence.adjusted {
@@ -77,7 +77,7 @@ impl<'a> Walk<'a> {
         self.evidence.given
     }
 
-    /// Returns runs of given images, of images of the capture in any order.
+    /// Returns the ranges of given images for images of the capture, in any order.
     pub(super) fn runs(&self, images: impl IntoIterator<Item = usize>) -> Vec<Range<usize>> {
         let mut given: Vec<usize> = images.into_iter().map(|image| self.index[image]).collect();
         given.retain(|index| *index < self.given().len());
@@ -86,7 +86,7 @@ impl<'a> Walk<'a> {
         words::runs(&given)
     }
 
-    /// Returns them in words.
+    /// Formats ranges of images.
     pub(super) fn spans(&self, runs: &[Range<usize>]) -> String {
         words::spans(self.given(), runs)
     }

@@ -1,10 +1,10 @@
-//! Images as people find them in a video.
+//! Names and times of images, as people find them in a video.
 
 use std::ops::Range;
 
 use super::Given;
 
-/// Returns runs of ascending numbers.
+/// Returns the ranges of consecutive numbers.
 pub(super) fn runs(ascending: &[usize]) -> Vec<Range<usize>> {
     let mut runs: Vec<Range<usize>> = Vec::new();
     for &index in ascending {
@@ -16,7 +16,7 @@ pub(super) fn runs(ascending: &[usize]) -> Vec<Range<usize>> {
     runs
 }
 
-/// Returns runs of images, with their times where they have any: "12 to 20 (7.4 s to 12.4 s), 31 (19.2 s)".
+/// Formats ranges of images, with times if available: "12 to 20 (7.4 s to 12.4 s), 31 (19.2 s)".
 pub(super) fn spans(given: &[Given], runs: &[Range<usize>]) -> String {
     let one = |run: &Range<usize>| {
         let (first, last) = (&given[run.start], &given[run.end - 1]);
@@ -42,5 +42,5 @@ pub(super) fn spans(given: &[Given], runs: &[Range<usize>]) -> String {
     words.join(", ")
 }
 
-/// More than this nobody reads.
+/// Maximum number of ranges in a message.
 const MANY: usize = 5;

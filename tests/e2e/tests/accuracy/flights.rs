@@ -1,4 +1,4 @@
-//! Flights with known truth through the simulated lab, and how well they are located.
+//! Flights with known truth through the simulated lab, and the accuracy of their localization.
 
 use glam::{DQuat, DVec2, DVec3, EulerRot};
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -9,10 +9,10 @@ use vizflyt_tags::locate::{LocateSettings, LocateSetup, Locator, StampedImage};
 use vizflyt_tags::print::Pad;
 use vizflyt_tags::simulated::{Sensor, SimulatedCamera, Truth};
 
-/// A path, by the way flown on it. [m -> m, world]
+/// Position on a path by distance flown. [m -> m, world]
 pub(crate) type Path = fn(f64) -> DVec3;
 
-/// A square of 2 m about the hall's middle, corners rounded as vehicles do.
+/// A square of 2 m about the hall's centre, with rounded corners like a real flight.
 pub(crate) fn square(s_m: f64) -> DVec3 {
     let at = (s_m / 2.0).rem_euclid(4.0);
     let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
@@ -25,7 +25,7 @@ pub(crate) fn square(s_m: f64) -> DVec3 {
     (0..16).map(|i| place((at + (f64::from(i) - 7.5) / 64.0).rem_euclid(4.0))).sum::<DVec3>() / 16.0
 }
 
-/// A spiral that widens from 0.5 to 1.4 m and climbs from 0.6 to 1.9 m, and back.
+/// A spiral: radius 0.5 to 1.4 m, height 0.6 to 1.9 m, and back.
 pub(crate) fn spiral(s_m: f64) -> DVec3 {
     let t = (1.0 - (s_m / 12.0 * std::f64::consts::PI).cos()) / 2.0;
     let angle = s_m / 0.95;
@@ -39,7 +39,7 @@ pub(crate) fn lemniscate(s_m: f64) -> DVec3 {
     DVec3::new(5.5 + 2.5 * angle.sin(), 1.8 * angle.sin() * angle.cos(), 1.2 + 0.2 * angle.cos())
 }
 
-/// Returns where a vehicle is on a path: it leans into its accelerations and turns slowly.
+/// Returns the pose of a vehicle on a path: it leans into its accelerations and turns slowly.
 pub(crate) fn pose_on(path: impl Fn(f64) -> DVec3, speed_mps: f64, t_s: f64) -> Pose<World, Body> {
     let at = |t: f64| path(speed_mps * t);
     let h = 0.08;
@@ -49,7 +49,7 @@ pub(crate) fn pose_on(path: impl Fn(f64) -> DVec3, speed_mps: f64, t_s: f64) -> 
     Pose::new(at(t_s), DQuat::from_rotation_arc(DVec3::Z, thrust) * yaw)
 }
 
-/// Where the vehicle of the simulated room takes off and lands.
+/// Returns the take-off and landing pads of the simulated room.
 pub(crate) fn pads() -> Vec<Pad> {
     let landing_m = DVec2::new(1.2, 0.35);
     vec![
@@ -58,54 +58,54 @@ pub(crate) fn pads() -> Vec<Pad> {
     ]
 }
 
-/// How well a flight was located.
+/// Accuracy of a flight's localization.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Figures {
-    /// Sets of images.
+    /// Number of sets of images.
     pub(crate) sets: usize,
-    /// Of the position. [m]
+    /// Position errors. [m]
     pub(crate) errors_m: Vec<f64>,
-    /// Of the attitude. [rad]
+    /// Attitude errors. [rad]
     pub(crate) errors_rad: Vec<f64>,
-    /// Errors in units of their predicted standard deviations: squared, of six numbers.
+    /// Sum of squared errors in units of the predicted standard deviations, of six components.
     pub(crate) squared_sigmas: f64,
-    /// Likewise, of the position's three alone.
+    /// Sum of squared errors in units of the predicted standard deviations, of the position's three components.
     pub(crate) squared_sigmas_m: f64,
-    /// Why sets gave no pose.
+    /// Reasons of sets without a pose.
     pub(crate) unlocated: Vec<String>,
-    /// Pixels looked at, of all.
+    /// Sum of the searched fractions of the images.
     pub(crate) looked_at: f64,
 }
 
 impl Figures {
-    /// Returns the root mean square of the position's error. [mm]
+    /// Returns the RMS position error. [mm]
     pub(crate) fn rms_mm(&self) -> f64 {
         rms(&self.errors_m) * 1e3
     }
 
-    /// Returns the error of the position that one in a hundred exceeds. [mm]
+    /// Returns the 99th percentile of the position error. [mm]
     pub(crate) fn p99_mm(&self) -> f64 {
         let mut sorted = self.errors_m.clone();
         sorted.sort_by(f64::total_cmp);
         sorted.get((sorted.len() as f64 * 0.99) as usize).map_or(f64::NAN, |m| m * 1e3)
     }
 
-    /// Returns the root mean square of the attitude's error. [deg]
+    /// Returns the RMS attitude error. [deg]
     pub(crate) fn rms_deg(&self) -> f64 {
         rms(&self.errors_rad).to_degrees()
     }
 
-    /// Returns in how many of a hundred sets of images the vehicle was located. [%]
+    /// Returns the fraction of sets in which the vehicle was located. [%]
     pub(crate) fn availability_percent(&self) -> f64 {
         100.0 * self.errors_m.len() as f64 / self.sets as f64
     }
 
-    /// Returns the mean squared error in units of its sigma; 1 is honest.
+    /// Returns the mean squared error in units of sigma; 1 means correct sigmas.
     pub(crate) fn consistency(&self) -> f64 {
         self.squared_sigmas / (6 * self.errors_m.len()) as f64
     }
 
-    /// Returns the same of the position alone.
+    /// Returns the mean squared error of only the position, in units of sigma.
     #[allow(dead_code, reason = "the bench prints that of the whole pose")]
     pub(crate) fn position_consistency(&self) -> f64 {
         self.squared_sigmas_m / (3 * self.errors_m.len()) as f64
@@ -116,8 +116,8 @@ fn rms(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
 }
 
-/// Flies and locates. Cameras are exposed one after the other, spread over the interval, as free webcams
-/// are, unless `together`.
+/// Flies and locates. Exposures of the cameras are spread over the interval, as for unsynchronised webcams, unless
+/// `together` is set.
 pub(crate) fn fly(
     cameras: Vec<TagCamera>,
     layouts: &[TagLayout],
@@ -134,8 +134,8 @@ pub(crate) fn fly(
     locate(simulated.collect(), layouts, seconds, pose_at)
 }
 
-/// Flies with a webcam under the vehicle over the hall's mat, which has pads, with what a survey and a ruler leave wrong
-/// by this seed; images are drawn by `before`.
+/// Flies with a webcam under the vehicle over the hall's mat with pads. Errors of survey and mount follow from the
+/// seed; `before` creates the camera that draws the images.
 pub(crate) fn fly_over_mat(
     pads: Vec<Pad>,
     seed: u64,
@@ -152,7 +152,7 @@ pub(crate) fn fly_over_mat(
     run(locator, cameras, &truth.layouts, seconds, pose_at)
 }
 
-/// Flies before cameras and locates.
+/// Flies in front of cameras and locates.
 pub(crate) fn locate(
     simulated: Vec<SimulatedCamera>,
     layouts: &[TagLayout],

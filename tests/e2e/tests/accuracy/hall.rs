@@ -1,4 +1,4 @@
-//! The lab's hall behind the tags: generated splats, rendered as the images are.
+//! The lab's hall as a background of the tags: generated splats.
 
 use std::sync::{Arc, Mutex};
 
@@ -9,7 +9,7 @@ use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::image::Gray;
 use vizflyt_tags::simulated::{Background, Sensor, SimulatedCamera};
 
-/// Returns the cameras in the hall, spread over the interval as free webcams are.
+/// Returns the cameras in the hall, with exposures spread over the interval as for unsynchronised webcams.
 pub(crate) fn seen_by(cameras: Vec<TagCamera>) -> Vec<SimulatedCamera> {
     let count = cameras.len() as f64;
     let before = before();
@@ -20,7 +20,7 @@ pub(crate) fn seen_by(cameras: Vec<TagCamera>) -> Vec<SimulatedCamera> {
     seen.collect()
 }
 
-/// Returns what puts a camera into the hall.
+/// Returns a function that puts a camera into the hall.
 pub(crate) fn before() -> impl Fn(TagCamera, Sensor) -> SimulatedCamera {
     let hall = Arc::new(Mutex::new(CpuRenderer::new(&generate(SceneKind::Room, 7).splats)));
     move |camera, sensor| {
@@ -29,7 +29,7 @@ pub(crate) fn before() -> impl Fn(TagCamera, Sensor) -> SimulatedCamera {
     }
 }
 
-/// Renders for one lens; again only where the camera has moved.
+/// Returns the background for a lens; it is rendered again only if the camera has moved.
 fn background(hall: Arc<Mutex<CpuRenderer>>, intrinsics: Intrinsics) -> Background {
     let mut last: Option<(Pose<World, Cam>, Gray)> = None;
     Background::new(move |world_from_cam: &Pose<World, Cam>| {

@@ -1,5 +1,5 @@
-//! `vizflyt scene align`: photos of a walk, taken by a phone's lens with a rolling shutter, whose poses are in a frame of
-//! no room; printed tags that stand in it, or a motion capture that followed the phone; out comes where the scene lies.
+//! `vizflyt scene align`: photos of a walk through a lens with a rolling shutter, with poses in an arbitrary frame.
+//! Printed tags in the room, or a motion capture that tracked the phone, determine the alignment of the scene.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -22,7 +22,7 @@ fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
 }
 
-/// Returns where an image was taken. [m, world]
+/// Returns the pose of an image. [m, world]
 fn pose(image: &Value) -> (DVec3, DQuat) {
     let pose = &image["world_from_cam"];
     let p_m = DVec3::from_slice(&numbers(&pose["position_m"]));
@@ -33,8 +33,8 @@ fn truth(capture: &Path) -> Value {
     serde_json::from_slice(&fs::read(capture.join("truth.json")).unwrap()).unwrap()
 }
 
-/// Writes nerfstudio's `transforms.json` beside the photos: the true poses, seen from the capture's own frame.
-/// Of the images every `step`th.
+/// Writes nerfstudio's `transforms.json` next to the photos: the true poses in the capture's frame, for every `step`th
+/// image.
 fn write_transforms(capture: &Path, shaken_m: f64, step: usize) {
     let truth = truth(capture);
     let camera = &truth["camera"];
@@ -48,7 +48,7 @@ fn write_transforms(capture: &Path, shaken_m: f64, step: usize) {
         .enumerate()
         .map(|(index, image)| {
             let (p_m, q) = pose(image);
-            // A structure from motion is off by so much, each time elsewhere.
+            // Errors like those of structure from motion, different for each image.
             let phase = index as f64 * 2.4;
             let off_m = DVec3::new(phase.sin(), phase.cos(), (1.7 * phase).sin()) * shaken_m;
             let p = back * (p_m + off_m - TRANSLATION_M) / SCALE;
@@ -70,7 +70,7 @@ fn write_transforms(capture: &Path, shaken_m: f64, step: usize) {
     fs::write(capture.join("transforms.json"), transforms.to_string()).unwrap();
 }
 
-/// The bars of a metric twin: 0.3 %, 0.2 degrees, 2 cm.
+/// Asserts the accuracy of a metric twin: 0.3 %, 0.2 degrees, 2 cm.
 fn check_place(arena: &str) {
     let scene = ArenaConfig::parse(arena).unwrap().scene;
     let scale = scene.metres_per_unit / SCALE - 1.0;
@@ -87,7 +87,7 @@ fn check_place(arena: &str) {
 }
 
 #[test]
-fn a_capture_with_tags_finds_its_place_in_the_room() {
+fn aligns_a_capture_by_tags() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
     let (ok, said) = run_in(
@@ -122,7 +122,7 @@ fn a_capture_with_tags_finds_its_place_in_the_room() {
     assert!(text.starts_with("# Ours.\n"), "{text}");
     check_place(&text);
 
-    // Poses of a poor reconstruction: the place is not known, nothing is written, and it says why.
+    // Inaccurate poses: the alignment is rejected with a reason, and nothing is written.
     write_transforms(&capture, 0.25, 1);
     let (ok, said) = run_in(home, &align);
     assert!(!ok, "{said}");
@@ -130,9 +130,9 @@ fn a_capture_with_tags_finds_its_place_in_the_room() {
     assert_eq!(fs::read_to_string(&arena).unwrap(), text);
 }
 
-/// A motion capture at the video's 30 Hz, its millimetre of noise, its own clock, a marker beside the lens.
+/// A motion capture at the video's 30 Hz, with millimetres of noise, its own clock, and a marker next to the lens.
 #[test]
-fn a_track_of_the_phone_finds_its_place_in_the_room() {
+fn aligns_a_capture_by_a_track_of_the_phone() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
     let film = "--capture walk --frames 900 --seconds 30 --size 80x64 -o hall";
@@ -168,17 +168,18 @@ fn a_track_of_the_phone_finds_its_place_in_the_room() {
         let align = ["scene", "align", "hall", "--capture", "walk", "--track", track];
         run_in(home, &[&align[..], more].concat())
     };
-    // Carried level: how high the marker sits above the lens must be measured (here 2 mm wrong).
+    // The phone is carried level, so the height of the marker above the lens must be given (here with an error of 2
+    // mm).
     let (ok, said) = align("track.txt", &["--times", "times.csv"]);
     assert!(!ok && said.contains("--tracked-at"), "{said}");
     let align = |track: &str, times: &[&str]| align(track, &[&beside[..], times].concat());
-    // When the images were taken nobody has said.
+    // The times of the images are missing.
     let (ok, said) = align("track.txt", &[]);
     assert!(!ok && said.contains("--times"), "{said}");
-    // Not this walk.
+    // The track of another walk.
     let (ok, said) = align("mirrored.txt", &["--times", "times.csv"]);
     assert!(!ok && (said.contains("is not the track") || said.contains("NO GO")), "{said}");
-    // Its own times, but the images' twice as fast.
+    // The right track, but a wrong frame rate of the images.
     let (ok, said) = align("track.txt", &["--rate", "60"]);
     assert!(!ok, "{said}");
     assert_eq!(fs::read_to_string(&arena).unwrap(), before);
@@ -189,7 +190,7 @@ fn a_track_of_the_phone_finds_its_place_in_the_room() {
 }
 
 #[test]
-fn what_cannot_be_aligned_is_explained() {
+fn errors_name_the_remedy() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
     fs::write(home.join("room.ply"), "ply\n").unwrap();
@@ -198,12 +199,12 @@ fn what_cannot_be_aligned_is_explained() {
     let align =
         |arena: &str, more: &[&str]| run_in(home, &[&["scene", "align", arena], more].concat());
     for (arena, more, word) in [
-        ("room.ply", &floor[..], "make one around the scene"),
-        ("nowhere", &floor[..], "no arena"),
-        ("nowhere", &[][..], "no arena"),
+        ("room.ply", &floor[..], "create one for the scene"),
+        ("nowhere", &floor[..], "not an arena"),
+        ("nowhere", &[][..], "not an arena"),
         ("nowhere", &["--track", "t.csv"][..], "--capture"),
         ("nowhere", &["--tags", "t.toml"][..], "--capture"),
-        ("nowhere", &["--floor", "0,0"][..], "no point"),
+        ("nowhere", &["--floor", "0,0"][..], "not a point"),
     ] {
         let (ok, said) = align(arena, more);
         assert!(!ok && said.contains(word), "{arena} {more:?}: {said}");

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use cargo_metadata::{DependencyKind, MetadataCommand};
 
-/// (crate, what of ours it may import).
+/// (crate, our crates that it may import).
 const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-protocol", &[]),
     ("vizflyt-rgbd", &["vizflyt-protocol"]),
@@ -19,10 +19,10 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-tags", &["vizflyt-protocol", "vizflyt-toml"]),
     ("vizflyt-avoid", &["vizflyt-sdk"]),
     ("vizflyt-race", &["vizflyt-sdk"]),
-    // It links its own DDS, which nothing else shall.
+    // It links its own DDS library, which no other crate should.
     ("vizflyt-ros2", &["vizflyt-sdk", "vizflyt-rgbd"]),
     ("vizflyt-c", &["vizflyt-sdk"]),
-    // The generator knows the truth; the server must never see it, so it does not import scenes.
+    // The generator contains the true geometry. The server must never have it, so it does not import scenes.
     ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena", "vizflyt-toml"]),
     ("vizflyt-twin", &["vizflyt-protocol", "vizflyt-splat"]),
     (
@@ -124,7 +124,7 @@ const ARROWS: &[(&str, &[&str])] = &[
         ],
     ),
     ("vizflyt-e2e", &[]),
-    // For tests alone: dev-dependencies are no arrows.
+    // Only for tests: dev-dependencies are not checked.
     ("vizflyt-fixtures", &[]),
     (
         "vizflyt-fuzz",

@@ -1,6 +1,6 @@
-//! `vizflyt scene capture` with poses that exist already: photos of a walk, a model of them in a frame of no room as COLMAP
-//! writes it, tags that stand in it; out comes a twin in metres that can be flown, or what to film again. With structure
-//! from motion itself it is tried by `tests/capture/run`.
+//! `vizflyt scene capture` with given poses: photos of a walk, a COLMAP model of them in an arbitrary frame, tags in
+//! the room. The result is a metric twin that can be flown, or advice what to film again. `tests/capture/run` tests
+//! structure from motion itself.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -61,13 +61,13 @@ fn truth(capture: &Path) -> Truth {
     Truth { lens, images: images.collect() }
 }
 
-/// Numbers that look random, -1 to 1.
+/// Returns a pseudo-random number, -1 to 1.
 fn noise(n: usize) -> f64 {
     (((n as f64 * 12.9898).sin() * 43_758.545_3).fract()).clamp(-1.0, 1.0)
 }
 
-/// Writes a model of COLMAP: the true poses, but for `moved`, seen from a frame of no room, and points of the air that the
-/// images see to 0.3 px.
+/// Writes a COLMAP model: the true poses displaced by `moved`, in an arbitrary frame, and random points in the air that
+/// the images see with 0.3 px noise.
 fn write_model(
     folder: &Path,
     truth: &Truth,
@@ -104,7 +104,7 @@ fn write_model(
             .unwrap();
         let mut index = 0;
         for (id, &p_m) in points_m.iter().enumerate() {
-            // The room bends with the poses, as it does where structure from motion errs.
+            // The room deforms with the poses, as in an erroneous structure from motion.
             let p_cam = pose.inverse().transform_point(p_m);
             let far = !(0.3..7.0).contains(&p_cam.z);
             let Some(pixel) = k.project(p_cam).filter(|_| !far) else { continue };
@@ -136,7 +136,7 @@ fn modified(path: &Path) -> SystemTime {
     fs::metadata(path).unwrap().modified().unwrap()
 }
 
-/// Runs the program with the words of two texts; returns whether it succeeded, and what it printed.
+/// Runs the program with the words of two texts; returns whether it succeeded, and its output.
 fn run_words(home: &Path, words: &str, more: &str) -> (bool, String) {
     run_in(home, &words.split_whitespace().chain(more.split_whitespace()).collect::<Vec<_>>())
 }
@@ -148,7 +148,7 @@ fn film(home: &Path, more: &str) {
 }
 
 #[test]
-fn photos_with_poses_become_a_twin_in_metres() {
+fn photos_with_poses_become_a_metric_twin() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
     film(home, "--tags --frames 60");
@@ -159,7 +159,7 @@ fn photos_with_poses_become_a_twin_in_metres() {
                      --splats 4000 --width 80";
         run_words(home, words, more)
     };
-    // So little training leaves floaters where the start should be: whether it can be flown is not asked here.
+    // So little training leaves floaters at the start position; this test does not check whether the twin can be flown.
     let (_, said) = capture("");
     println!("{said}");
     let record: Value =
@@ -176,11 +176,11 @@ fn photos_with_poses_become_a_twin_in_metres() {
     }
     let off_m = (squares / way.len() as f64).sqrt();
     println!("off by {:.1} mm", off_m * 1e3);
-    // The bar of a metric twin, in the room's own frame.
+    // Maximum error of a metric twin, in the room's own frame.
     assert!(off_m < 0.02, "{off_m}");
     let arena =
         ArenaConfig::parse(&fs::read_to_string(home.join("hall/arena.toml")).unwrap()).unwrap();
-    // The walk is within the fence, and the start is on it.
+    // The walk must be within the fence, and the start on the walk.
     let fence = &arena.geofence;
     let is_inside = |p: DVec3| p.cmpgt(fence.min_m).all() && p.cmplt(fence.max_m).all();
     assert!(truth.images.iter().all(|(_, pose)| is_inside(pose.translation_m)), "{fence:?}");
@@ -192,7 +192,7 @@ fn photos_with_poses_become_a_twin_in_metres() {
     assert!(!page.contains("It is refused.") && page.contains("<svg"));
     assert!(page.matches("data:image/jpeg;base64,").count() >= 8);
 
-    // Again: nothing is done again, but what is asked for.
+    // A second run repeats only the requested stages.
     let metric = home.join("hall/stages/metric.json");
     let trained = home.join("hall/stages/train.json");
     let before = (modified(&metric), modified(&trained));
@@ -204,7 +204,7 @@ fn photos_with_poses_become_a_twin_in_metres() {
     assert_eq!(modified(&metric), before.0);
     assert_ne!(modified(&trained), before.1);
 
-    // A model whose second half stands 3 m beside the first, and some images nowhere: refused, and nothing to fly by is left.
+    // A model with its second half displaced by 3 m, and some images without poses: rejected, and the arena is removed.
     let half = |n: usize| if n >= 30 { DVec3::new(3.0, 1.0, 0.0) } else { DVec3::ZERO };
     write_model(&home.join("model"), &truth, half, |n| !(10..20).contains(&n));
     let (ok, said) = capture("");
@@ -215,9 +215,9 @@ fn photos_with_poses_become_a_twin_in_metres() {
     assert!(page.contains("It is refused."), "{page}");
 }
 
-/// Photos without a tag, and a motion capture's 15 Hz of a marker beside the lens, on its own clock.
+/// Photos without tags, and a motion capture at 15 Hz with a marker next to the lens, on its own clock.
 #[test]
-fn a_motion_capture_gives_photos_metres_and_their_place() {
+fn track_determines_scale_and_position_of_photos() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
     film(home, "--frames 120 --seconds 8 --size 80x64");
@@ -254,7 +254,7 @@ fn a_motion_capture_gives_photos_metres_and_their_place() {
 }
 
 #[test]
-fn what_cannot_be_captured_is_explained() {
+fn errors_name_the_remedy() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
     fs::create_dir(home.join("empty")).unwrap();
@@ -265,9 +265,9 @@ fn what_cannot_be_captured_is_explained() {
     for (args, says) in [
         (&["nothing.mp4", "-o", "out"][..], "neither a video nor a folder"),
         (&["empty", "-o", "out"], "no photos"),
-        (&["hall.mp4", "-o", "out"], "no video that ffmpeg reads"),
+        (&["hall.mp4", "-o", "out"], "cannot read hall.mp4 as a video"),
         (&["walk", "-o", "thesis", "--poses", "empty"], "another folder"),
-        (&["walk", "-o", "out", "--poses", "empty"], "holds no poses"),
+        (&["walk", "-o", "out", "--poses", "empty"], "contains no poses"),
         (&["walk", "-o", "out", "--python", "no-python"], "pip install pycolmap"),
         (&["walk", "-o", "out", "--length", "3=2"], "3,8=4.52"),
         (&["walk", "-o", "out", "--tags", "a.toml", "--tag-size", "0.2"], "cannot be used with"),
@@ -277,7 +277,7 @@ fn what_cannot_be_captured_is_explained() {
         let (ok, said) = run_in(home, &[&["scene", "capture"], args].concat());
         assert!(!ok && said.contains(says), "{args:?}: {said}");
         let report = home.join("out/report.html");
-        // What was asked wrongly is no capture; what stopped has a report.
+        // Wrong arguments leave no report; a failed stage does.
         if report.exists() {
             let page = fs::read_to_string(&report).unwrap();
             assert!(
@@ -291,16 +291,16 @@ fn what_cannot_be_captured_is_explained() {
     }
 }
 
-/// What is said where a stage, or what it needs, fails.
-const STOPS: [&str; 3] = ["no video", "holds no poses", "pip install"];
+/// Messages of failed stages or of missing programs.
+const STOPS: [&str; 3] = ["as a video", "contains no poses", "pip install"];
 
-/// Programs that are found here, and fail as those do that people have.
+/// Failures of installed programs as users have them.
 #[test]
-fn a_stage_that_fails_leaves_a_report() {
+fn failed_stage_leaves_a_report() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
     film(home, "--frames 8 --size 64x64");
-    // A Python whose pycolmap places nothing.
+    // A Python with a pycolmap that places no image.
     let python = home.join("python");
     fs::write(&python, "#!/bin/sh\ncase \"$*\" in *version*) echo 4.2.1;; esac\n").unwrap();
     fs::set_permissions(&python, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
@@ -314,9 +314,12 @@ fn a_stage_that_fails_leaves_a_report() {
         (said, record, fs::read_to_string(home.join("hall/report.html")).unwrap())
     };
     let (said, record, page) = capture(&["--python", python.to_str().unwrap()]);
-    assert!(said.contains("places no pictures"), "{said}");
+    assert!(said.contains("cannot place any picture"), "{said}");
     assert_eq!(record["failure"]["stage"], "poses");
-    assert!(record["failure"]["what"].as_str().unwrap().contains("places no pictures"), "{record}");
+    assert!(
+        record["failure"]["what"].as_str().unwrap().contains("cannot place any picture"),
+        "{record}"
+    );
     assert_eq!(record["pictures"]["pictures"].as_array().unwrap().len(), 8);
     assert!(
         page.contains("It stopped in its stage poses.") && page.contains("film slowly"),
@@ -324,9 +327,9 @@ fn a_stage_that_fails_leaves_a_report() {
     );
     assert!(page.contains("8 of 64 x 64 px"), "what is known is there: {page}");
 
-    // Poses that are of other pictures altogether.
+    // A folder without poses.
     fs::create_dir(home.join("other")).unwrap();
     let (_, record, page) = capture(&["--poses", "other"]);
     assert_eq!(record["failure"]["stage"], "poses");
-    assert!(page.contains("holds no poses"), "{page}");
+    assert!(page.contains("contains no poses"), "{page}");
 }

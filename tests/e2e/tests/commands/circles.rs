@@ -1,4 +1,4 @@
-//! Inside each crate, at most three files import each other in a circle: a reader needs no more of them at once.
+//! In each crate, at most three files may import each other in a cycle, so that a reader needs no more files at once.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -8,9 +8,9 @@ use cargo_metadata::MetadataCommand;
 use syn::visit::{self, Visit};
 use syn::{Attribute, ItemFn, ItemImpl, ItemMod, ItemUse, UseTree, Visibility};
 
-/// Files of the largest permitted circle.
+/// Maximum number of files in a cycle.
 const LARGEST: usize = 3;
-/// Names from the root of a crate.
+/// Path of names from the root of a crate.
 type Module = Vec<String>;
 
 #[test]
@@ -32,7 +32,7 @@ fn at_most_three_files_import_each_other() {
 }
 
 #[test]
-fn a_circle_is_found_through_a_re_export() {
+fn finds_a_cycle_through_a_re_export() {
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
     write("lib.rs", "mod a; mod b; pub use b::B;");
@@ -44,7 +44,7 @@ fn a_circle_is_found_through_a_re_export() {
     assert_eq!(circles, [expected].into());
 }
 
-/// The files of a crate, by their modules.
+/// Files of a crate by module.
 struct Modules(BTreeMap<Module, Imports>);
 
 impl Modules {
@@ -70,7 +70,7 @@ impl Modules {
         Self(modules)
     }
 
-    /// Returns the file in which a path ends, seen from a module.
+    /// Returns the file that defines a path, as seen from a module.
     fn resolve(&self, from: &Module, path: &[String]) -> Option<Module> {
         let (mut module, mut rest) = match path.first()?.as_str() {
             "crate" => (Module::new(), &path[1..]),
@@ -99,7 +99,7 @@ impl Modules {
         self.0.contains_key(&module).then_some(module)
     }
 
-    /// Returns the groups of files that import each other, directly or through others.
+    /// Returns the groups of files that import each other, directly or indirectly.
     fn circles(&self) -> BTreeSet<BTreeSet<Module>> {
         let imported = |module: &Module| -> Vec<Module> {
             let paths = &self.0[module].paths;
@@ -125,11 +125,11 @@ impl Modules {
     }
 }
 
-/// What the code of a file names in other files; not its tests.
+/// Names that the code of a file imports from other files, without its tests.
 #[derive(Default)]
 struct Imports {
     paths: Vec<Vec<String>>,
-    /// `pub use`, by the name that others use.
+    /// `pub use` items by their exported name.
     re_exports: BTreeMap<String, Vec<String>>,
 }
 
@@ -171,7 +171,7 @@ impl<'ast> Visit<'ast> for Imports {
         visit::visit_path(self, path);
     }
 
-    // A module in braces has another `super`; there are few but tests.
+    // Inline modules have another `super`; almost all of them are tests.
     fn visit_item_mod(&mut self, _: &'ast ItemMod) {}
 
     fn visit_item_fn(&mut self, item: &'ast ItemFn) {

@@ -1,4 +1,4 @@
-//! The command line's output when used, and when used wrongly.
+//! Output of the command line for correct and wrong use.
 
 use std::process::{Command, Stdio};
 
@@ -34,7 +34,7 @@ fn every_command_has_help() {
 }
 
 #[test]
-fn a_scene_is_the_same_for_the_same_seed() {
+fn same_seed_generates_the_same_scene() {
     let folder = tempfile::tempdir().unwrap();
     let make = |name: &str, seed: &str| {
         let path = folder.path().join(name);
@@ -45,7 +45,7 @@ fn a_scene_is_the_same_for_the_same_seed() {
     let first = make("a", "5");
     assert!(first == make("b", "5"), "two generations with one seed differ");
     assert!(first[0] != make("c", "6")[0], "another seed makes the same scene");
-    // Nothing is overwritten by accident.
+    // Existing files are not overwritten without `--force`.
     let again = folder.path().join("a");
     check_refused(
         &["scene", "generate", "race", "-o", again.to_str().unwrap()],
@@ -54,7 +54,7 @@ fn a_scene_is_the_same_for_the_same_seed() {
 }
 
 #[test]
-fn a_trajectory_that_cannot_be_evaluated_is_explained() {
+fn errors_of_evaluate_name_the_cause() {
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| {
         let path = folder.path().join(name);
@@ -63,7 +63,7 @@ fn a_trajectory_that_cannot_be_evaluated_is_explained() {
     };
     let truth = write("truth.tum", "0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 2 0 0 0 0 0 1\n");
     let later = write("later.tum", "100 0 0 0 0 0 0 1\n");
-    check_refused(&["evaluate", &truth, &later], &["within 0.01 s", "one clock"]);
+    check_refused(&["evaluate", &truth, &later], &["within 0.01 s", "same clock"]);
     let short = write("short.tum", "0 0 0 0\n");
     check_refused(&["evaluate", &truth, &short], &["line 1", "4 numbers"]);
     check_refused(&["evaluate", &truth, &truth, "--align", "se3"], &["cannot be aligned", "line"]);
@@ -74,7 +74,7 @@ fn a_trajectory_that_cannot_be_evaluated_is_explained() {
 }
 
 #[test]
-fn mistakes_are_explained() {
+fn errors_name_the_cause() {
     check_refused(
         &["demo", "--scene", "forrest"],
         &["forrest", "no generated scene (forest, race"],
@@ -100,11 +100,11 @@ fn mistakes_are_explained() {
 }
 
 #[test]
-fn an_error_says_its_cause_once() {
+fn errors_name_their_cause_once() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("a-file");
     std::fs::write(&file, "").unwrap();
-    // Nothing can be made below a file, not even by root.
+    // Nothing can be created below a file, not even by root.
     let below = file.join("below");
     let (file, below) = (file.to_str().unwrap(), below.to_str().unwrap());
     let (into, made) = (format!("{below}.ply"), folder.path().join("scene"));
@@ -135,8 +135,8 @@ fn an_error_says_its_cause_once() {
 }
 
 #[test]
-fn a_reader_that_leaves_is_no_panic() {
-    // What reads the first line only, as `head -1` does, with both streams.
+fn does_not_panic_if_the_reader_closes_the_pipe() {
+    // Like `head -1`, but for both streams.
     for args in [["leaderboard", "--help"], ["arena", "check"], ["bench", "render"]] {
         let arena = ["--project=p5", "--seeds=3"];
         let more: &[&str] = if args == ["arena", "check"] { &arena } else { &[] };
@@ -147,7 +147,7 @@ fn a_reader_that_leaves_is_no_panic() {
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
-        // Gone before anything is written.
+        // Close the pipe before anything is written.
         drop(child.stdout.take());
         let output = child.wait_with_output().unwrap();
         let message = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -158,7 +158,7 @@ fn a_reader_that_leaves_is_no_panic() {
 }
 
 #[test]
-fn no_colours_reach_files_and_pipes() {
+fn writes_no_colours_to_files_and_pipes() {
     let folder = tempfile::tempdir().unwrap();
     let arena = folder.path().join("forest");
     let text = arena.to_str().unwrap();
@@ -170,7 +170,7 @@ fn no_colours_reach_files_and_pipes() {
 }
 
 #[test]
-fn a_taken_port_of_the_demo_names_its_own_option() {
+fn demo_names_its_own_option_for_a_port_in_use() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let port = format!("--port={}", taken.local_addr().unwrap().port());
     check_refused(&["demo", "--headless", &port], &["give another --port"]);

@@ -1,4 +1,4 @@
-//! `vizflyt dataset` as a person uses it: parts, interruptions and threads change no byte; what is wrong is told.
+//! `vizflyt dataset`: shards, interruptions and threads do not change any byte, and errors name the cause.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 use vizflyt_e2e::{check_refused, good, root};
 
-/// All files of a folder, by their names from it.
+/// Returns all files of a folder by relative name.
 fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     let mut folders = vec![folder.to_owned()];
@@ -36,7 +36,7 @@ impl Rig {
         self.0.path().join(name).to_str().unwrap().to_owned()
     }
 
-    /// Twelve small images of two courses.
+    /// Renders twelve small images of two courses.
     fn render(&self, name: &str, more: &[&str]) -> BTreeMap<PathBuf, Vec<u8>> {
         let (folder, how) = (self.at(name), root().join("docs/guides/randomize.toml"));
         let how = how.to_str().unwrap();
@@ -48,14 +48,14 @@ impl Rig {
 }
 
 #[test]
-fn parts_interruptions_and_threads_change_no_byte() {
+fn shards_interruptions_and_threads_do_not_change_any_byte() {
     let rig = Rig::new();
     let whole = rig.render("whole", &["--threads", "2"]);
     for name in ["images/train/000000.png", "flow/val/000011.png", "annotations/instances_val.json"]
     {
         assert!(whole.contains_key(Path::new(name)), "{name} is not in {:?}", whole.keys());
     }
-    // 7 layers less `next`, and the record.
+    // 7 layers except `next`, and the record.
     assert_eq!(whole.len(), 12 * 7 + 2 + 1);
 
     let first = rig.render("parts", &["--shard", "1/3", "--threads", "1"]);
@@ -64,7 +64,7 @@ fn parts_interruptions_and_threads_change_no_byte() {
     let parts = rig.render("parts", &["--shard", "2/3"]);
     assert_eq!(parts, whole);
 
-    // An image without its record is none, and is rendered again; broken ones too.
+    // An image without its record, or a damaged one, is rendered again.
     let folder = PathBuf::from(rig.at("parts"));
     for name in
         ["records/train/000003.json", "depth/train/000003.png", "annotations/instances_val.json"]
@@ -76,7 +76,7 @@ fn parts_interruptions_and_threads_change_no_byte() {
 }
 
 #[test]
-fn annotations_name_what_is_in_the_images() {
+fn annotations_match_the_images() {
     let rig = Rig::new();
     let sheet = rig.at("sheet.jpg");
     let whole = rig.render("set", &["--things", "gate,moving,distractor", "--sheet", &sheet]);
@@ -104,7 +104,7 @@ fn annotations_name_what_is_in_the_images() {
 }
 
 #[test]
-fn other_layouts_and_a_path_of_a_scene_file() {
+fn writes_other_formats_along_a_path_in_a_scene_file() {
     let rig = Rig::new();
     good(&["scene", "generate", "race", "--seed", "4", "-o", &rig.at("race")]);
     let path = rig.at("path.tum");
@@ -130,7 +130,7 @@ fn other_layouts_and_a_path_of_a_scene_file() {
     let truth = text(&euroc, "scene-1/mav0/state_groundtruth_estimate0/data.csv");
     let row: Vec<f64> =
         truth.lines().nth(2).unwrap().split(',').map(|cell| cell.parse().unwrap()).collect();
-    // Where the path has it, upright, at 0.1 m/s along x.
+    // Pose of the path, upright, at 0.1 m/s along x.
     for (found, expected) in row[1..].iter().zip([0.6, 0.0, 1.2, 1.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
     {
         assert!((found - expected).abs() < 1e-9, "{truth}");
@@ -147,19 +147,19 @@ fn other_layouts_and_a_path_of_a_scene_file() {
 }
 
 #[test]
-fn what_is_wrong_is_told() {
+fn errors_name_the_cause() {
     let rig = Rig::new();
     let out = rig.at("out");
     let refused = |more: &[&str], told: &[&str]| {
         check_refused(&[&["dataset", "--project", "p3", "-o", &out], more].concat(), told);
     };
     refused(&["--fov", "200"], &["--fov 200", "10 to 150"]);
-    refused(&["--layers", "depth"], &["lacks rgb"]);
-    refused(&["--things", "gates"], &["no such class", "gate, vehicle"]);
+    refused(&["--layers", "depth"], &["must include rgb"]);
+    refused(&["--things", "gates"], &["unknown class", "gate, vehicle"]);
     refused(&["--seeds", "9", "--images", "3"], &["9 courses"]);
     refused(&["--gate-distance", "5..1"], &["0.8..5"]);
     refused(&["--path", "nowhere.tum"], &["nowhere.tum"]);
-    refused(&["--images", "2", "--clearance", "2"], &["no place", "--clearance"]);
+    refused(&["--images", "2", "--clearance", "2"], &["positions has a clearance", "--clearance"]);
     let how = rig.at("how.toml");
     fs::write(&how, "[fog]\nprobability = 2\n").unwrap();
     refused(&["--randomize", &how], &["how.toml", "fog.probability = 2"]);
@@ -168,5 +168,5 @@ fn what_is_wrong_is_told() {
     good(&["dataset", "--project", "p3", "-o", &rig.at("set"), "--images", "2", "--size", "32x24"]);
     let again =
         ["dataset", "--project", "p3", "-o", &rig.at("set"), "--images", "3", "--size", "32x24"];
-    check_refused(&again, &["holds another data set", "images is 2", "3 is asked for"]);
+    check_refused(&again, &["contains another data set", "images is 2", "3 is requested"]);
 }

@@ -1,21 +1,21 @@
-//! A crate that is built or tested alone uses the dependencies that `cargo build` has compiled: every dependency has the same
-//! features whatever is selected.
+//! Every dependency must have the same features for any selection of crates, so that building or testing a single crate
+//! uses the dependencies that `cargo build` has compiled.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 use cargo_metadata::MetadataCommand;
 
-/// Crates that an everyday build leaves out.
+/// Crates that a normal build omits.
 const LEFT_OUT: [&str; 2] = ["vizflyt-ros2", "vizflyt-fuzz"];
 /// Crates that plugins and chips link, with fewer of our own features.
 const SLIM: [&str; 4] = ["vizflyt-rgbd", "vizflyt-sdk", "vizflyt-c", "vizflyt-bridge"];
 
-/// By package and version, the sets of features with which it is compiled: for the target, and for build scripts.
+/// Feature sets by package and version: one for the target, one for build scripts.
 type Features = BTreeMap<String, BTreeSet<String>>;
 
 #[test]
-fn dependencies_have_the_same_features_whatever_is_selected() {
+fn dependencies_have_the_same_features_for_any_selection() {
     let whole = features(
         &["--workspace", "--exclude=vizflyt-ros2", "--exclude=vizflyt-fuzz"],
         "normal,dev,build",
@@ -36,7 +36,7 @@ fn dependencies_have_the_same_features_whatever_is_selected() {
     );
 }
 
-/// Returns the packages that a selection compiles with features which the whole workspace does not give them.
+/// Returns the packages that a selection compiles with features that the complete workspace does not enable.
 fn different(name: &str, selected: &Features, whole: &Features) -> Vec<String> {
     let differs = |(package, sets): (&String, &BTreeSet<String>)| {
         let other = sets.difference(whole.get(package)?).next()?;
@@ -61,9 +61,9 @@ fn features(selection: &[&str], edges: &str) -> Features {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let mut features = Features::new();
     for line in String::from_utf8(output.stdout).expect("cargo prints text").lines() {
-        // Headings of kinds of dependencies have none.
+        // Headings of dependency kinds have no separator.
         let Some((package, set)) = line.split_once('|') else { continue };
-        // Without the folder of a crate of ours, or "(proc-macro)".
+        // Without the folder of our crates, or "(proc-macro)".
         let package = package.split(" (").next().unwrap_or(package);
         features.entry(package.to_owned()).or_default().insert(set.to_owned());
     }

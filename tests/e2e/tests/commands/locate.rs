@@ -1,5 +1,5 @@
-//! `vizflyt tags locate` as a program: the truth comes in, webcams are rendered, the pose goes out; and the same from
-//! images on disk.
+//! `vizflyt tags locate` as a program: receives true poses, renders webcams, sends the located pose; and its errors for
+//! wrong settings.
 
 use std::net::UdpSocket;
 use std::process::Command;
@@ -12,7 +12,7 @@ use nix::time::{ClockId, clock_gettime};
 use serde_json::{Value, json};
 use vizflyt_e2e::{Demo, vizflyt};
 
-/// Anything here comes within this, however loaded the machine is.
+/// Timeout, for any load of the machine.
 const PATIENCE: Duration = Duration::from_mins(1);
 
 fn now_ns() -> u64 {
@@ -20,7 +20,7 @@ fn now_ns() -> u64 {
     now.tv_sec() as u64 * 1_000_000_000 + now.tv_nsec() as u64
 }
 
-/// Where the vehicle is: a slow circle in the hall's middle.
+/// Returns the pose of the vehicle: a slow circle in the hall's centre.
 fn truth(stamp_ns: u64) -> (DVec3, DQuat) {
     let angle = (stamp_ns % 1_000_000_000_000) as f64 * 0.5e-9;
     let p_m = DVec3::new(5.5 + 0.8 * angle.cos(), 0.6 * angle.sin(), 1.2);
@@ -28,7 +28,7 @@ fn truth(stamp_ns: u64) -> (DVec3, DQuat) {
 }
 
 #[test]
-fn simulated_webcams_locate_what_the_truth_says() {
+fn simulated_webcams_locate_the_true_pose() {
     let receiver = UdpSocket::bind("127.0.0.1:0").unwrap();
     receiver.set_read_timeout(Some(PATIENCE)).unwrap();
     let to = receiver.local_addr().unwrap().to_string();
@@ -83,7 +83,7 @@ fn simulated_webcams_locate_what_the_truth_says() {
     }
     done.store(true, Ordering::Relaxed);
     feed.join().unwrap();
-    // A loaded machine leaves images out, and a lone camera far away is worse.
+    // A loaded machine drops images, and a single distant camera is less accurate.
     errors_m.sort_by(f64::total_cmp);
     assert!(errors_m[poses / 2] < 0.02, "{} m in the middle", errors_m[poses / 2]);
     assert!(errors_m[poses * 9 / 10] < 0.1, "{errors_m:?}");
@@ -92,7 +92,7 @@ fn simulated_webcams_locate_what_the_truth_says() {
 }
 
 #[test]
-fn impossible_localization_settings_are_named() {
+fn errors_name_invalid_localization_settings() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let check = |text: &str, part: &str| {

@@ -1,4 +1,4 @@
-//! Black-box tests of commands that need no clock, and of the imports between crates.
+//! Black-box tests of commands without a clock, and of the imports between crates.
 
 mod align;
 mod arrows;

@@ -1,6 +1,5 @@
-//! Distance fields that move along with their objects, against the true geometry of generated ones:
-//! nothing missed beyond one voxel, hardly anything reported that is free by one and a half, at every
-//! instant.
+//! Distance fields that move with their objects, compared with the true geometry at many times: nothing is missed
+//! beyond one voxel, and almost nothing is reported that is free by one and a half voxels.
 
 use std::sync::Arc;
 
@@ -12,19 +11,19 @@ use vizflyt_protocol::geometry::Volume;
 use vizflyt_scenes::{SceneKind, generate};
 use vizflyt_server::scene::obstacles;
 
-/// Radius of the body that touches or does not. [m]
+/// Radius of the body for collisions. [m]
 const BODY_M: f64 = 0.12;
-/// Of an object's field. [m]
+/// Voxel size of an object's field. [m]
 const VOXEL_M: f64 = 0.02;
-/// Near enough to a solid to matter. [m]
+/// Maximum distance of a test point from an object's surface. [m]
 const NEAR_M: f64 = 0.4;
-/// By then some of what is touched has moved on. [ns]
+/// Time after which some of the touched objects have moved on. [ns]
 const LATER_NS: i64 = 300_000_000;
 const INSTANTS: i64 = 40;
 const PLACES: usize = 400;
 
 #[test]
-fn moving_objects_are_touched_where_they_are() {
+fn detects_collisions_with_moving_objects_at_their_position() {
     for (kind, seed) in [(SceneKind::Race, 7), (SceneKind::Moving, 7), (SceneKind::Moving, 3)] {
         let scene = generate(kind, seed);
         let nothing = Grid::covering(DVec3::ZERO, DVec3::ONE, 0.5);
@@ -39,7 +38,7 @@ fn moving_objects_are_touched_where_they_are() {
         };
         let [mut touching, mut missed, mut gone, mut clear, mut alarms] = [0; 5];
         for instant in 0..INSTANTS {
-            // No divisor of any period.
+            // Not a divisor of any period.
             let ns = instant * 173_000_011;
             let truth_m = |p_world_m: DVec3| {
                 let to = |(index, solids): (usize, &Vec<_>)| {
@@ -51,7 +50,7 @@ fn moving_objects_are_touched_where_they_are() {
             };
             for place in 0..PLACES {
                 let index = place % scene.objects.len();
-                // About any of its splats.
+                // A point near a random splat.
                 let means_m = &scene.objects[index].splats.means_m;
                 let mean_m = means_m[(next() * means_m.len() as f64) as usize].as_dvec3();
                 let aside_m = (DVec3::new(next(), next(), next()) * 2.0 - 1.0) * NEAR_M;

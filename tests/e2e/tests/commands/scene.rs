@@ -1,4 +1,4 @@
-//! `vizflyt scene` and `vizflyt bench` as a person uses them, and as a script does.
+//! `vizflyt scene` and `vizflyt bench` as used by people and scripts.
 
 use std::collections::HashMap;
 use std::fs::{self, File};
@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use vizflyt_e2e::{check_refused, good, root, vizflyt};
 use vizflyt_fixtures::WebSocket;
 
-/// A generated scene and a camera in it, in a folder that cleans up.
+/// A generated scene and a camera in it, in a temporary folder.
 struct Rig(tempfile::TempDir);
 
 impl Rig {
@@ -37,7 +37,7 @@ impl Rig {
     }
 }
 
-/// An array as numpy saves it, of f32 or u16.
+/// An array of f32 or u16 in numpy's format.
 struct Array {
     shape: Vec<usize>,
     values: Vec<f32>,
@@ -64,7 +64,7 @@ fn saved(folder: &str, name: &str) -> Array {
     array(&fs::read(Path::new(folder).join(name)).unwrap()).expect("f32 or u16")
 }
 
-/// Width, height, bits per channel and colour type of a PNG (its IHDR).
+/// Returns width, height, bits per channel and colour type of a PNG (its IHDR).
 fn png_head(path: &Path) -> (u32, u32, u8, u8) {
     let bytes = fs::read(path).unwrap();
     assert_eq!(&bytes[..8], b"\x89PNG\r\n\x1a\n");
@@ -73,7 +73,7 @@ fn png_head(path: &Path) -> (u32, u32, u8, u8) {
 }
 
 #[test]
-fn obstacles_are_baked_once_and_kept() {
+fn obstacles_are_baked_once_and_cached() {
     let rig = Rig::new();
     let bake = |more: &[&str]| {
         let output = Command::new(vizflyt())
@@ -98,7 +98,7 @@ fn obstacles_are_baked_once_and_kept() {
 }
 
 #[test]
-fn pictures_are_written_as_png_and_as_arrays() {
+fn writes_images_as_png_and_as_arrays() {
     let rig = Rig::new();
     let printed = good(&[
         "scene",
@@ -143,9 +143,9 @@ fn pictures_are_written_as_png_and_as_arrays() {
     assert!(a > 0.5 && (a / b - 1.0).abs() < 0.2, "expected {a} m, median {b} m");
 }
 
-/// A door that slides: its pixels are known by their ids, and are elsewhere a second later.
+/// A sliding door: its pixels, known by their ids, have moved a second later.
 #[test]
-fn moving_objects_are_rendered_at_their_time() {
+fn renders_moving_objects_at_a_time() {
     let rig = Rig::new();
     let (scene, camera) = (rig.at("moving"), rig.at("cam.json"));
     good(&["scene", "generate", "moving", "-o", &scene]);
@@ -168,7 +168,7 @@ fn moving_objects_are_rendered_at_their_time() {
 }
 
 #[test]
-fn mistakes_in_a_picture_are_explained() {
+fn render_errors_name_the_cause() {
     let rig = Rig::new();
     let (scene, camera) = (rig.at("race"), rig.at("cam.json"));
     let out = rig.at("out");
@@ -178,7 +178,7 @@ fn mistakes_in_a_picture_are_explained() {
     render(&rig.at("gone.ply"), &camera, &["there is no", "vizflyt scene generate"]);
     render(&scene, &rig.at("gone.json"), &["cannot read", "gone.json", "as a camera"]);
     rig.write("bad.json", "{\"fx\": 1");
-    render(&scene, &rig.at("bad.json"), &["bad.json is no camera", "w2c (4x4", "line 1"]);
+    render(&scene, &rig.at("bad.json"), &["bad.json is not a valid camera", "w2c (4x4", "line 1"]);
     rig.write("notes.txt", "just words, of no format at all");
     render(&rig.at("notes.txt"), &camera, &["supported are", "PLY", "SPZ", ".splat", "SOG"]);
     fs::create_dir(rig.at("empty")).unwrap();
@@ -194,13 +194,13 @@ fn mistakes_in_a_picture_are_explained() {
     );
     check_refused(
         &["bench", "render", &scene, "--camera", &camera, "--size", "big"],
-        &["'big' is no size in pixels; write it as 640x480"],
+        &["'big' is not a size in pixels; write it as 640x480"],
     );
     assert!(!Path::new(&out).exists(), "nothing is left behind");
 }
 
 #[test]
-fn a_scene_is_inspected() {
+fn inspects_a_scene() {
     let rig = Rig::new();
     let found: Value =
         serde_json::from_str(&good(&["scene", "inspect", &rig.at("race"), "--json"])).unwrap();
@@ -212,7 +212,7 @@ fn a_scene_is_inspected() {
 }
 
 #[test]
-fn a_benchmark_prints_what_scripts_read() {
+fn benchmark_prints_json_for_scripts() {
     let rig = Rig::new();
     let (scene, camera) = (rig.at("race"), rig.at("cam.json"));
     let args = ["bench", "render", &scene, "--camera", &camera, "--images", "4", "--size", "96x72"];
@@ -229,7 +229,7 @@ fn a_benchmark_prints_what_scripts_read() {
 }
 
 #[test]
-fn named_sensors_are_measured_and_drawn() {
+fn benchmarks_and_draws_named_sensors() {
     let rig = Rig::new();
     let (scene, camera, sheet) = (rig.at("race"), rig.at("cam.json"), rig.at("sensors.png"));
     let args = ["bench", "sensors", &scene, "--camera", &camera, "--count", "2"];
@@ -242,12 +242,12 @@ fn named_sensors_are_measured_and_drawn() {
         let kind = kinds.iter().find(|kind| kind["name"] == name);
         kind.and_then(|kind| kind["records"].as_u64()).unwrap()
     };
-    // A hall has walls and a floor, wherever a beam looks.
+    // A hall has walls and a floor in every direction of a beam.
     assert!(records("vlp-16") > 12_000 && records("os1-64") > 48_000, "{figures:#}");
     assert!(records("iwr6843") > 0, "{figures:#}");
     let picture = image::open(&sheet).unwrap().to_rgb8();
     assert_eq!(picture.dimensions(), (4 * 244, 3 * 244));
-    // The first looks all around: points below it are blue, points above it red.
+    // The first sensor looks all around: points below it are blue, points above it red.
     let reddest = |sign: i32| {
         let pixels = (0..240).flat_map(|y| (0..240).map(move |x| (x, y)));
         let of = |(x, y)| {
@@ -263,12 +263,12 @@ fn named_sensors_are_measured_and_drawn() {
     check_refused(&[&args[..], &["--sensor", "vlp"]].concat(), &["vlp-16", "tfmini"]);
 }
 
-/// The renderer against an independent one in float64; see `../shared/tools/splat_oracle.py`.
+/// Compares the renderer with an independent one in float64; see `../shared/tools/splat_oracle.py`.
 #[test]
-fn pictures_are_those_of_the_oracle() {
+fn images_match_the_reference_renderer() {
     let shared = root().join("../shared/scenes");
     if !shared.join("room.ply").exists() {
-        println!("skipped: the captured scenes are not beside the repository");
+        println!("skipped: the captured scenes are not next to the repository");
         return;
     }
     let folder = tempfile::tempdir().unwrap();
@@ -327,9 +327,9 @@ fn psnr(a: &[f32], b: &[f32]) -> f64 {
     -10.0 * mean.log10()
 }
 
-/// The page asks for a picture over its WebSocket, copies the camera, and `scene render` draws it.
+/// The page requests an image over its WebSocket and copies the camera; `scene render` renders the same view.
 #[test]
-fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
+fn viewer_serves_a_page_and_renders_its_requests() {
     let rig = Rig::new();
     let mut child = Command::new(vizflyt())
         .args(["scene", "view", &rig.at("race"), "--no-browser"])
@@ -351,7 +351,7 @@ fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
     };
     let text = get("/");
     assert!(text.starts_with("HTTP/1.1 200") && text.contains("<canvas"), "{text}");
-    // It shows the scene, and changes nothing.
+    // The viewer is read-only.
     for path in ["/api/align", "/api/course", "/api/edit"] {
         assert!(get(path).starts_with("HTTP/1.1 404"), "{path}");
     }
@@ -388,10 +388,10 @@ fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
     assert!(child.wait().unwrap().success());
 }
 
-/// A room of 10 x 6 x 3 m in units of a quarter of a metre, y down: floor, ceiling, walls, and shelves along one.
+/// Returns a room of 10 x 6 x 3 m in units of 0.25 m, y down: floor, ceiling, walls, and shelves along one wall.
 fn captured_room() -> Vec<u8> {
     let mut rows: Vec<[f32; 14]> = Vec::new();
-    // Normal to z, y or x, by a quarter turn about x, or y.
+    // Normals along z, y or x, by a quarter turn about x or y.
     let half = std::f32::consts::FRAC_1_SQRT_2;
     let turns = [[1.0, 0.0, 0.0, 0.0], [half, half, 0.0, 0.0], [half, 0.0, half, 0.0]];
     let mut face = |turn: usize, corner: [f32; 3], u: [f32; 3], v: [f32; 3]| {
@@ -430,9 +430,9 @@ fn captured_room() -> Vec<u8> {
     bytes
 }
 
-/// From a capture to an arena that is checked, baked and rendered; and what is refused on the way.
+/// From a capture to an arena that is checked, baked and rendered, with rejected inputs.
 #[test]
-fn a_captured_room_gets_an_arena() {
+fn creates_an_arena_for_a_captured_room() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     fs::write(at("room.ply"), captured_room()).unwrap();
@@ -450,7 +450,8 @@ fn a_captured_room_gets_an_arena() {
     check_refused(&["arena", "new", &at("mine"), "--scene", &at("room.ply")], &["already exists"]);
     check_refused(&["arena", "new", &at("x"), "--scene", &at("mine")], &["is an arena already"]);
 
-    // Cameras of an arena are the world's: half a metre under the ceiling, looking down, it is 2.5 m.
+    // Cameras of an arena are in the world frame: half a metre under the ceiling, looking down, it is 2.5 m to the
+    // floor.
     let w2c = json!([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.5], [0, 0, 0, 1]]);
     let camera = json!({"fx": 40, "fy": 40, "cx": 8, "cy": 8, "w": 16, "h": 16, "w2c": w2c});
     fs::write(at("down.json"), camera.to_string()).unwrap();
@@ -463,7 +464,7 @@ fn a_captured_room_gets_an_arena() {
     let depth_m = render(&at("mine"));
     assert!((depth_m - 2.5).abs() < 0.05, "{depth_m} m to the floor");
 
-    // The same from a file that was placed for good.
+    // The same depth with a converted file.
     let converted = at("upright.ply");
     good(&["scene", "convert", &at("room.ply"), &converted, "--up", "-y", "--scale", "0.25"]);
     let origin = text.lines().find(|line| line.starts_with("origin")).unwrap();
@@ -473,14 +474,14 @@ fn a_captured_room_gets_an_arena() {
     fs::write(at("placed/arena.toml"), upright.replace("../room.ply", "../upright.ply")).unwrap();
     assert!((render(&at("placed")) - depth_m).abs() < 1e-3);
 
-    // On its head, on its end, elsewhere, far too large, and not at all.
+    // Upside down, on its side, displaced, far too large, and without alignment.
     let refused = |name: &str, change: &dyn Fn(&str) -> String, expected: &str| {
         fs::create_dir_all(at(name)).unwrap();
         fs::write(at(&format!("{name}/arena.toml")), change(&text)).unwrap();
         let checked = vizflyt_e2e::run(&["arena", "check", &at(name)]);
         let printed = String::from_utf8_lossy(&checked.stdout).into_owned();
         assert!(!checked.status.success() && printed.contains(expected), "{name}: {printed}");
-        check_refused(&["scene", "bake", &at(name)], &["cannot be meant", expected]);
+        check_refused(&["scene", "bake", &at(name)], &["does not fit its arena", expected]);
     };
     for (up, expected) in [("y", "upside down"), ("x", "on its side"), ("-x", "on its side")] {
         new(up, &["--up", up]);
@@ -495,7 +496,7 @@ fn a_captured_room_gets_an_arena() {
     };
     refused("elsewhere", &set("origin", "[300, 0, 0]"), "100 % of the scene lies outside");
     refused("no-floor", &set("origin", "[-3, 5, 1.4]"), "has no floor there");
-    // The short form says that it lies in the world already, and it does not: on its side.
+    // The short form requires a scene in the world frame, but this scene lies on its side.
     let file = "[scene]\nfile = \"../room.ply\"\nup = \"-y\"\nmetres_per_unit = 0.25\n";
     let short = |text: &str| {
         let body = text.replace(file, "").replace(origin, "");
@@ -505,7 +506,7 @@ fn a_captured_room_gets_an_arena() {
     };
     refused("short", &short, "spawn.position_m");
 
-    // Flags of a bare scene do not place an arena's.
+    // Options for scenes without an arena are rejected for an arena.
     for command in [&["scene", "bake"][..], &["scene", "view"]] {
         let mine = at("mine");
         let args = [command, &[mine.as_str(), "--up", "z", "--scale", "2"]].concat();
@@ -526,7 +527,7 @@ fn a_captured_room_gets_an_arena() {
     );
 }
 
-/// The files of a folder, by name.
+/// Returns the files of a folder by name.
 fn files_of(folder: &str) -> Vec<(String, Vec<u8>)> {
     let mut files: Vec<(String, Vec<u8>)> = fs::read_dir(folder)
         .unwrap()
@@ -540,7 +541,7 @@ fn files_of(folder: &str) -> Vec<(String, Vec<u8>)> {
 }
 
 #[test]
-fn a_capture_is_images_with_their_truth_and_the_same_again() {
+fn capture_has_images_and_truth_and_is_reproducible() {
     let home = tempfile::tempdir().unwrap();
     let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
     let film = |kind: &str, name: &str, more: &[&str]| {
@@ -570,27 +571,27 @@ fn a_capture_is_images_with_their_truth_and_the_same_again() {
     assert_eq!(truth["images"].as_array().unwrap().len(), 4);
     assert_eq!(truth["images"][2]["file"], "00002.jpg");
     assert_eq!(truth["camera"]["width_px"], 160);
-    // The scene beside it has the boards: more true solids than without.
+    // The generated scene has the boards as additional true solids.
     let solids = |folder: &str| -> usize {
         let text = fs::read(Path::new(folder).join("truth.json")).unwrap();
         serde_json::from_slice::<Vec<Value>>(&text).unwrap().len()
     };
     good(&["scene", "generate", "room", "--seed", "3", "-o", &at("plain")]);
     assert!(solids(&at("room")) > solids(&at("plain")) + 5);
-    // What moves stands still unless asked; either way each scene can be filmed.
+    // Objects move only if requested; every kind of scene can be filmed.
     for kind in ["race", "moving", "forest"] {
         film(kind, kind, &["--moving"]);
         let truth = fs::read(Path::new(&at(kind)).join("truth.json")).unwrap();
         assert_eq!(serde_json::from_slice::<Value>(&truth).unwrap()["scene"]["moving"], true);
     }
-    // Not over what is there.
+    // Existing files are not overwritten.
     let a = at("a");
     let args = ["scene", "generate", "room", "--capture", &a];
-    check_refused(&args, &["truth.json is there already", "--force"]);
+    check_refused(&args, &["truth.json already exists", "--force"]);
 }
 
 #[test]
-fn a_capture_that_cannot_be_made_says_why() {
+fn capture_errors_name_the_cause() {
     let home = tempfile::tempdir().unwrap();
     let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
     let refused = |more: &[&str], parts: &[&str]| {
@@ -617,13 +618,13 @@ fn a_capture_that_cannot_be_made_says_why() {
 }
 
 #[test]
-fn a_video_decodes_to_as_many_images_of_its_size() {
+fn video_has_the_requested_number_and_size_of_images() {
     let home = tempfile::tempdir().unwrap();
     let video = home.path().join("hall.mp4");
     let capture = video.to_str().unwrap();
     let args = ["--seconds", "2", "--frames", "20", "--size", "320x240", "--capture", capture];
     good(&[&["scene", "generate", "room", "--seed", "3"][..], &args].concat());
-    // Decoded by ffmpeg to raw grey.
+    // Decode with ffmpeg to raw grey.
     let raw = Command::new("ffmpeg")
         .args(["-nostdin", "-v", "error", "-i", capture, "-f", "rawvideo", "-pix_fmt", "gray", "-"])
         .output()

@@ -1,5 +1,5 @@
-//! `vizflyt bridge emulate` from outside: a pseudo-terminal on one side, sockets on the other, and
-//! what happens to MAVLink between them. The same core runs on the chips.
+//! Black-box tests of `vizflyt bridge emulate`: a pseudo-terminal on one side, sockets on the other, MAVLink in
+//! between. The same core runs on the chips.
 
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Read, Write};
@@ -16,7 +16,7 @@ use vizflyt_protocol::mavlink::dialect::{
 };
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, StreamDecoder, encode};
 
-/// Anything that takes longer is broken, on any machine.
+/// Timeout for any machine.
 const PATIENCE: Duration = Duration::from_mins(1);
 /// O_NONBLOCK | O_NOCTTY on Linux.
 const FLAGS: i32 = 0o4000 | 0o400;
@@ -27,7 +27,7 @@ struct Rig {
     uart: File,
     companion: UdpSocket,
     tcp: String,
-    /// Where its status page is; empty if it has none.
+    /// Address of its status page; empty if it has none.
     page: String,
     folder: tempfile::TempDir,
 }
@@ -94,7 +94,7 @@ fn param(param_index: u16) -> MavMessage {
     MavMessage::PARAM_VALUE(PARAM_VALUE_DATA { param_index, ..Default::default() })
 }
 
-/// Reads what is there, without waiting.
+/// Reads all available packets, without waiting.
 fn read(from: &mut impl Read, decoder: &mut StreamDecoder, into: &mut Vec<MavMessage>) {
     let mut bytes = [0; 4096];
     loop {
@@ -107,10 +107,10 @@ fn read(from: &mut impl Read, decoder: &mut StreamDecoder, into: &mut Vec<MavMes
     }
 }
 
-/// Receives what is there; each datagram holds whole packets.
+/// Receives all available datagrams; each contains complete packets.
 fn receive(socket: &UdpSocket, into: &mut Vec<MavMessage>) {
     let mut bytes = [0; 2048];
-    // Refused while the bridge is down: as good as nothing there.
+    // Refused while the bridge is down: treat like no data.
     while let Ok(len) = socket.recv(&mut bytes) {
         let mut decoder = StreamDecoder::default();
         decoder.push(&bytes[..len], |packet| into.push(packet.message));
@@ -118,7 +118,7 @@ fn receive(socket: &UdpSocket, into: &mut Vec<MavMessage>) {
     }
 }
 
-/// Turns `step` until it is true.
+/// Repeats `step` until it returns true.
 fn until(what: &str, mut step: impl FnMut() -> bool) {
     let end = Instant::now() + PATIENCE;
     while !step() {
@@ -128,10 +128,10 @@ fn until(what: &str, mut step: impl FnMut() -> bool) {
 }
 
 #[test]
-fn thousands_of_packets_pass_both_ways_and_none_is_lost_or_changed() {
+fn carries_thousands_of_packets_both_ways_without_loss_or_change() {
     let mut rig = Rig::start(&[]);
     let (mut up, mut down) = (Vec::new(), Vec::new());
-    // Not setpoints: of those the bridge leaves out late ones, and this machine may be late.
+    // No setpoints: the bridge drops late ones, and this machine may be slow.
     let (mut decoder, count) = (StreamDecoder::default(), 2000u32);
     let mut sent = 0;
     rig.companion.send(&packet(0, (255, 191), &heartbeat(false))).unwrap();
@@ -141,7 +141,7 @@ fn thousands_of_packets_pass_both_ways_and_none_is_lost_or_changed() {
         !down.is_empty()
     });
     until("all packets are through", || {
-        // No more at once than the line and its queues hold: the counters must stay at zero.
+        // Limit the packets in transit to the capacity of line and queues: the drop counters must stay at zero.
         let through = up.len().min(down.len()) as u32;
         while sent < count && sent < through + 15 {
             rig.companion.send(&packet(sent as u8, (255, 191), &param(sent as u16))).unwrap();
@@ -174,7 +174,7 @@ fn stats(rig: &Rig) -> Value {
 }
 
 #[test]
-fn a_tcp_client_gets_everything_too() {
+fn carries_packets_for_a_tcp_client() {
     let mut rig = Rig::start(&[]);
     let mut client = TcpStream::connect(&rig.tcp).unwrap();
     client.set_nonblocking(true).unwrap();
@@ -193,14 +193,14 @@ fn a_tcp_client_gets_everything_too() {
 }
 
 #[test]
-fn a_killed_bridge_comes_back_and_everything_goes_on() {
+fn traffic_continues_after_a_killed_bridge_restarts() {
     let mut rig = Rig::start(&[]);
     let address = rig.companion.peer_addr().unwrap().to_string();
     let mut down = Vec::new();
     let mut carried = |rig: &mut Rig| {
         down.clear();
         until("telemetry comes", || {
-            // Refused while it is down: the companion goes on sending all the same.
+            // Refused while the bridge is down; the companion continues to send.
             let _ = rig.companion.send(&packet(0, (255, 191), &vision(1)));
             rig.uart.write_all(&packet(0, (1, 1), &attitude(1))).unwrap();
             receive(&rig.companion, &mut down);
@@ -208,7 +208,7 @@ fn a_killed_bridge_comes_back_and_everything_goes_on() {
         });
     };
     carried(&mut rig);
-    // Dropping kills it, as a power cut does.
+    // Dropping kills the bridge, like a power cut.
     let old = std::mem::replace(&mut rig.bridge, Demo::spawn(&mut Command::new("true")));
     drop(old);
     let (bridge, ready) = start(&rig.folder, &address, &[]);
@@ -246,13 +246,13 @@ fn bridge_is_claimed_configured_and_keeps_its_settings() {
     check(&[], true, "LOSS_MS            700");
     let (_, shown) = configure(&[]);
     assert!(!shown.contains("horse"), "{shown}");
-    // An armed vehicle's bridge stays as it is.
+    // The settings of an armed vehicle's bridge must not change.
     until("the bridge knows that the vehicle is armed", || {
         rig.uart.write_all(&packet(0, (1, 1), &heartbeat(true))).unwrap();
         let (worked, printed) = configure(&["LOSS_MS=800"]);
         !worked && printed.contains("armed")
     });
-    // Killed and started anew on the same flash.
+    // Kill and restart on the same flash.
     drop(rig);
     let rig = Rig::start(&[&flash]);
     let address = rig.companion.peer_addr().unwrap().to_string();
@@ -265,7 +265,7 @@ fn bridge_is_claimed_configured_and_keeps_its_settings() {
 }
 
 #[test]
-fn firmware_is_brought_over_the_network_and_judged_as_on_a_chip() {
+fn firmware_update_over_the_network_is_verified_as_on_a_chip() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     let firmware = |args: &[&str]| {
@@ -297,7 +297,7 @@ fn firmware_is_brought_over_the_network_and_judged_as_on_a_chip() {
     check(&sign("host", "6"), false, "older than the one that runs");
     check(&sign("esp32c3", "8"), false, "another chip");
     check(&image, false, "is not signed");
-    // One bit of the program, then one of the signature.
+    // Flip one bit of the program, then one of the signature.
     for (place, expected) in [(150_000, "not what was signed"), (60, "signature is not of")] {
         let mut bytes = std::fs::read(&seven).unwrap();
         bytes[place] ^= 1;
@@ -305,7 +305,7 @@ fn firmware_is_brought_over_the_network_and_judged_as_on_a_chip() {
         std::fs::write(&damaged, bytes).unwrap();
         check(&damaged, false, expected);
     }
-    // It is there all the while, for a browser too.
+    // The page is available all the time, also for a browser.
     let shown = get(&page, "/");
     assert!(shown.starts_with("HTTP/1.0 200") && shown.contains("no vehicle"), "{shown}");
     assert!(get(&page, "/stats.json").contains("\"uart_packets_in\""));
@@ -323,7 +323,7 @@ fn get(address: &str, path: &str) -> String {
 }
 
 #[test]
-fn the_demo_flies_with_every_byte_through_the_bridge() {
+fn demo_flies_through_the_bridge_without_drops() {
     let folder = tempfile::tempdir().unwrap();
     let report = folder.path().join("report.json");
     let mut demo = Demo::start(&[
@@ -337,7 +337,7 @@ fn the_demo_flies_with_every_byte_through_the_bridge() {
     demo.wait(Duration::from_mins(4));
     let report: Value = serde_json::from_str(&std::fs::read_to_string(report).unwrap()).unwrap();
     let outcome = report["outcome"].as_str().unwrap();
-    // It lands after its seconds, or has finished before.
+    // It lands after its time, or has finished before.
     assert!(["landed", "finished", "timeout"].contains(&outcome), "{report:#} {:#?}", demo.seen);
     let bridge = &report["bridge"];
     let count = |name: &str| bridge[name].as_u64().unwrap();

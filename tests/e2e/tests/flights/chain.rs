@@ -1,9 +1,9 @@
-//! The safety chain, in flight: a wall that only the twin has is answered by LAND, and the fence is
-//! kept by whatever is left when the server, the runtime, or the guard is not there.
+//! Safety chain in flight: a wall that exists only in the twin causes LAND, and the remaining programs keep the fence
+//! if the server, the runtime or the guard fails.
 //!
-//! The vehicle is watched from outside, by the motion capture's packets and its own heartbeats. Prints
-//! what it measures: `cargo test -p vizflyt-e2e --test flights chain -- --nocapture`. Times are not
-//! judged tighter than a loaded machine allows; `docs/BENCHMARKS.md` has those of a quiet one.
+//! The tests observe the vehicle from outside, by the packets of the motion capture and the vehicle's heartbeats. They
+//! print their measurements: `cargo test -p vizflyt-e2e --test flights chain -- --nocapture`. Time limits allow for a
+//! loaded machine; `docs/BENCHMARKS.md` has the times of an idle one.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -18,19 +18,19 @@ use vizflyt_protocol::mavlink::{
 use vizflyt_protocol::messages::YawTarget;
 use vizflyt_splat::{format, ply};
 
-/// Vehicles that fly into the wall, each twice a sample of the chain's time.
+/// Number of vehicles that fly into the wall; each is a sample of the chain's time.
 const VEHICLES: usize = 3;
-/// Where the wall stands. [m, world]
+/// Position of the wall. [m, world]
 const WALL_X_M: f64 = 2.0;
-/// Well over what the chain takes, and over what a loaded machine adds. [s]
+/// Time limit, far above the chain's time on an idle machine. [s]
 const LAND_WITHIN_S: f64 = 1.0;
-/// A limit on waiting; nothing takes half as long.
+/// Timeout, more than twice of what any wait needs.
 const PATIENCE: Duration = Duration::from_mins(2);
-/// Beyond the arena's fence by this much a vehicle may coast when nobody is left to brake it but the
-/// autopilot, half a second later. [m]
+/// Maximum distance by which a vehicle may overshoot the arena's fence if only the autopilot brakes it, half a second
+/// later. [m]
 const COAST_M: f64 = 0.8;
 
-/// Stands a wall across the room, of flat splats 3 cm apart.
+/// Adds a wall across the room, of flat splats 3 cm apart.
 fn furnish(folder: &Path) {
     let path = folder.join("scene.ply");
     let mut scene = format::read(&path).expect("the generated scene reads").splats;
@@ -47,7 +47,7 @@ fn furnish(folder: &Path) {
 }
 
 #[test]
-fn a_wall_of_the_twin_is_answered_by_land() {
+fn collision_with_a_wall_of_the_twin_causes_land() {
     let lab = Lab::open_in(VEHICLES, furnish);
     let plan = Plan { how: "forward", ..Plan::default() };
     let mut flights: Vec<_> = (0..VEHICLES).map(|index| lab.fly(index, plan)).collect();
@@ -56,8 +56,8 @@ fn a_wall_of_the_twin_is_answered_by_land() {
         let lines = flight.until("collision");
         let (_, line) = lines.last().expect("the line of the collision");
         let at_m = collision(line);
-        // The first packet in which the vehicle is where the server reports the touch, or 5 mm before it: a pose is what
-        // several packets say.
+        // The first packet with the vehicle where the server reports the collision, or 5 mm before: a fused pose
+        // results from several packets.
         let (track, _) = flight.so_far();
         let shown = track.iter().find(|sight| sight.p_m.x >= at_m.x - 5e-3 && sight.p_m.z > 0.3);
         let shown = shown.expect("the motion capture saw it there").at;
@@ -97,9 +97,9 @@ fn collision(line: &Value) -> DVec3 {
     DVec3::new(number(0), number(1), number(2))
 }
 
-/// A localization that is always 0.14 s late, and loses every twentieth pose, is flown by up to the fence.
+/// A localization with a constant delay of 0.14 s and 5 % lost poses, in a flight up to the fence.
 #[test]
-fn a_late_localization_keeps_the_fence() {
+fn keeps_the_fence_with_a_late_localization() {
     let lab = Lab::open_with(1, &format!("{LOCALIZATION}latency_ms = 140\n"));
     let vehicle = ["--airframe", "--mocap-delay-ms=140", "--mocap-drop-percent=5"];
     let more = ["--seconds=8"];
@@ -114,7 +114,7 @@ fn a_late_localization_keeps_the_fence() {
 }
 
 #[test]
-fn without_the_server_the_runtime_keeps_the_fence() {
+fn runtime_keeps_the_fence_without_the_server() {
     let mut lab = Lab::open(1);
     let mut flight = outward(&lab);
     lab.kill_server();
@@ -123,7 +123,7 @@ fn without_the_server_the_runtime_keeps_the_fence() {
 }
 
 #[test]
-fn without_the_runtime_the_guardian_lands_it() {
+fn guardian_lands_the_vehicle_without_the_runtime() {
     let lab = Lab::open(1);
     let mut flight = outward(&lab);
     flight.kill_runtime();
@@ -131,7 +131,7 @@ fn without_the_runtime_the_guardian_lands_it() {
 }
 
 #[test]
-fn without_runtime_and_guardian_the_autopilot_lands_it() {
+fn autopilot_lands_the_vehicle_without_runtime_and_guardian() {
     let lab = Lab::open(1);
     let mut flight = outward(&lab);
     flight.switch_off();
@@ -139,7 +139,7 @@ fn without_runtime_and_guardian_the_autopilot_lands_it() {
 }
 
 #[test]
-fn without_a_guard_the_autopilot_keeps_its_own_fence() {
+fn autopilot_keeps_its_own_fence_without_a_guard() {
     let lab = Lab::open(1);
     let mut flight = outward(&lab);
     flight.switch_off();
@@ -152,8 +152,7 @@ fn without_a_guard_the_autopilot_keeps_its_own_fence() {
     ends_inside(&mut flight, "no guard", COAST_M);
 }
 
-/// Flies on until the autopilot lands: somebody else's program, which knows of no fence, has taken
-/// over on the same link.
+/// Flies on until the autopilot lands: a program without a fence has taken over on the same link.
 fn fly_on(flight: &Flight) {
     let started = Instant::now();
     let mut sequence = 0;
@@ -166,12 +165,12 @@ fn fly_on(flight: &Flight) {
         if sequence % 20 == 1 {
             send(flight, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()), &mut sequence);
         }
-        // The setpoints' own rate, not a wait for something.
+        // Rate of the setpoints.
         std::thread::sleep(Duration::from_millis(25));
     }
 }
 
-/// Puts a pillar across the room that only `arena.toml` knows.
+/// Adds a pillar across the room that exists only in `arena.toml`.
 fn forbid(folder: &Path) {
     let path = folder.join("arena.toml");
     let text = std::fs::read_to_string(&path).expect("the arena reads");
@@ -182,9 +181,9 @@ fn forbid(folder: &Path) {
 }
 
 #[test]
-fn with_neither_server_nor_guard_the_autopilot_lands_at_a_no_fly_box() {
+fn autopilot_lands_at_a_no_fly_box_without_server_and_guard() {
     let mut lab = Lab::open_in(1, forbid);
-    // Its circle and its ceiling would not notice; the runtime has uploaded the box.
+    // Only the uploaded box: the autopilot's circle and ceiling are off.
     let mut flight = outward_with(&lab, &["--param=FENCE_TYPE=4"]);
     lab.kill_server();
     flight.switch_off();
@@ -198,13 +197,13 @@ fn with_neither_server_nor_guard_the_autopilot_lands_at_a_no_fly_box() {
     assert!(furthest_m < NO_FLY_X_M + COAST_M, "it was at {furthest_m} m");
 }
 
-/// Returns a flight that flies at the fence, as the plugin asks.
+/// Returns a flight towards the fence.
 fn outward(lab: &Lab) -> Flight {
     let fence = format!("--param=FENCE_RADIUS={FENCE_RADIUS_M}");
     outward_with(lab, &[&fence, "--param=FENCE_TYPE=3"])
 }
 
-/// As [`outward`], with the autopilot's own fence of this kind.
+/// Returns a flight towards the fence, with this kind of autopilot fence.
 fn outward_with(lab: &Lab, fence: &[&str]) -> Flight {
     let vehicle = [
         "--airframe",
@@ -224,8 +223,7 @@ fn outward_with(lab: &Lab, fence: &[&str]) -> Flight {
     flight
 }
 
-/// Waits until a vehicle is down, and expects that it has not left the fence by more than
-/// `beyond_m`.
+/// Waits until the vehicle is down, and asserts that it has not left the fence by more than `beyond_m`.
 fn ends_inside(flight: &mut Flight, what: &str, beyond_m: f64) {
     wait(what, || flight.now().p_m.z < 0.05);
     let (track, modes) = flight.so_far();
@@ -255,10 +253,10 @@ fn wait(what: &str, done: impl Fn() -> bool) {
     }
 }
 
-/// Where the lab's vehicles start, and the side of the room's fence that they fly at. [m, world]
+/// Start of the lab's vehicles, and the side of the room's fence in their direction of flight. [m, world]
 const START_X_M: f64 = 0.9;
 const FENCE_X_M: f64 = 2.6;
-/// Where a box begins that is not to be flown in. [m, world]
+/// Start of the no-fly box. [m, world]
 const NO_FLY_X_M: f64 = 2.4;
-/// The autopilot's own fence around the start: the corner of the arena's that they fly at. [m]
+/// Radius of the autopilot's own fence around the start. [m]
 const FENCE_RADIUS_M: f64 = 1.7;

@@ -1,7 +1,7 @@
-//! `vizflyt demo`, as a person runs it: the real binary, its real children, loopback, free ports.
+//! Tests of `vizflyt demo` with the real binary and child processes, on loopback and free ports.
 //!
-//! Nothing here fails because the machine is slow: limits are generous, figures are only checked
-//! for being there. `over_many_seeds` is the acceptance test of the example plugin.
+//! The tests must not fail on slow machines: limits are generous, and figures must only exist. `over_many_seeds` is the
+//! acceptance test of the example plugin.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -13,14 +13,14 @@ use nix::unistd::Pid;
 use serde_json::Value;
 use vizflyt_e2e::{Demo, alive, check_refused, descendants, good};
 
-/// Loading, baking, arming and climbing, on a loaded machine.
+/// Timeout for loading, baking, arming and climbing on a loaded machine.
 const AIRBORNE: Duration = Duration::from_secs(90);
-/// A whole flight.
+/// Timeout for a complete flight.
 const FLIGHT: Duration = Duration::from_mins(4);
-/// Printed when the plugin has the vehicle.
+/// Line that is printed when the plugin controls the vehicle.
 const FLYING: &str = "plugin flies";
 
-/// A report file in a folder that cleans up.
+/// A report file in a temporary folder.
 struct ReportFile(tempfile::TempDir);
 
 impl ReportFile {
@@ -48,12 +48,12 @@ fn signal(pid: u32, signal: Signal) {
     kill(Pid::from_raw(pid as i32), signal).unwrap();
 }
 
-/// Sends one HTTP request and returns the whole response.
+/// Sends an HTTP request and returns the complete response.
 fn http(url: &str, request: &str) -> String {
     http_body(url, request, "")
 }
 
-/// As [`http`], with a body.
+/// Sends an HTTP request with a body.
 fn http_body(url: &str, request: &str, body: &str) -> String {
     let address = url.trim_start_matches("http://").trim_end_matches('/');
     let mut stream = TcpStream::connect(address).unwrap();
@@ -70,7 +70,7 @@ fn page_url(demo: &mut Demo) -> String {
 }
 
 #[test]
-fn the_forest_is_flown_and_reported() {
+fn flies_the_forest_and_writes_a_report() {
     let file = ReportFile::new();
     let mut demo = file.demo(&["--seed", "7", "--seconds", "90", "--max-rate", "120"]);
     let url = page_url(&mut demo);
@@ -102,7 +102,7 @@ fn the_forest_is_flown_and_reported() {
     let log = std::fs::metadata(report["log"].as_str().unwrap()).unwrap();
     assert!(log.len() > 10_000, "the log has {} bytes", log.len());
 
-    // Judged again by the grader, from the log: the same.
+    // The grader's verdict from the log must be the same.
     let log = report["log"].as_str().unwrap();
     let verdict: Value =
         serde_json::from_str(&good(&["grade", "judge", log, "--seed=7", "--json"])).unwrap();
@@ -112,15 +112,15 @@ fn the_forest_is_flown_and_reported() {
     let judged_s = verdict["seconds"].as_f64().unwrap();
     assert!((live_s - judged_s).abs() < 0.11, "{reason}, and {judged_s} s");
     assert!(verdict["min_clearance_m"].as_f64().unwrap() > 0.0, "{verdict:#}");
-    // In another forest it would have hit a tree, or not have come through in this way.
+    // In another forest the verdict must differ.
     let other = good(&["grade", "judge", log, "--seed=8", "--json"]);
     assert!(serde_json::from_str::<Value>(&other).unwrap() != verdict);
     check_refused(&["grade", "judge", log, "--project=p5"], &["something moves in p5"]);
 }
 
-/// A server that gets a fifth of its processor, in slices: images are late and few.
+/// The server gets a fifth of its processor time, in slices: images are late and few.
 #[test]
-fn a_starved_server_slows_the_vehicle_and_nothing_is_touched() {
+fn starved_server_slows_the_vehicle_without_collision() {
     let file = ReportFile::new();
     let mut demo = file.demo(&["--seconds", "60", "--max-rate", "120"]);
     demo.wait_for(FLYING, AIRBORNE);
@@ -130,7 +130,7 @@ fn a_starved_server_slows_the_vehicle_and_nothing_is_touched() {
         scope.spawn(|| {
             while !over.load(Ordering::Relaxed) {
                 let id = Pid::from_raw(server.cast_signed());
-                // Less than poses may be silent.
+                // Shorter than the timeout for poses.
                 if kill(id, Signal::SIGSTOP).is_err() {
                     return;
                 }
@@ -149,9 +149,9 @@ fn a_starved_server_slows_the_vehicle_and_nothing_is_touched() {
     assert!(demo.seen.iter().any(is_told), "{:#?}", demo.seen);
 }
 
-/// No motion capture: webcams, tags, the filter, and everything behind them as ever.
+/// No motion capture: webcams, tags and the filter; all other parts as usual.
 #[test]
-fn the_room_is_flown_on_tags_alone() {
+fn flies_the_room_with_tags_only() {
     let file = ReportFile::new();
     let mut demo = file.demo(&["--localization", "tags", "--seconds", "120"]);
     let code = demo.wait(FLIGHT);
@@ -163,8 +163,8 @@ fn the_room_is_flown_on_tags_alone() {
     assert!(tags["located"].as_u64().unwrap() > 200, "{tags:#}");
 }
 
-/// Generated forests are flown without touching the true geometry, nine of ten at least, at 2 m/s or more on the
-/// mean. Twenty are flown in lock-step (`grade.rs`), where they are the same on every machine; these are live.
+/// At least nine of ten generated forests are flown without touching the true geometry, at a mean speed of at least 2
+/// m/s. `grade.rs` flies twenty in lock-step, with the same result on every machine; these flights are in real time.
 #[test]
 fn over_many_seeds() {
     let seeds: u64 =
@@ -197,7 +197,7 @@ fn over_many_seeds() {
 }
 
 #[test]
-fn a_killed_plugin_ends_in_a_landing_and_a_reason() {
+fn lands_and_reports_the_signal_if_the_plugin_is_killed() {
     let file = ReportFile::new();
     let mut demo = file.demo(&[]);
     demo.wait_for(FLYING, AIRBORNE);
@@ -213,7 +213,7 @@ fn a_killed_plugin_ends_in_a_landing_and_a_reason() {
 }
 
 #[test]
-fn a_killed_server_ends_in_a_hold_and_a_landing() {
+fn holds_and_lands_if_the_server_is_killed() {
     let file = ReportFile::new();
     let mut demo = file.demo(&[]);
     demo.wait_for(FLYING, AIRBORNE);
@@ -228,7 +228,7 @@ fn a_killed_server_ends_in_a_hold_and_a_landing() {
 }
 
 #[test]
-fn the_stop_button_lands_the_vehicle() {
+fn stop_button_lands_the_vehicle() {
     let file = ReportFile::new();
     let mut demo = file.demo(&[]);
     let url = page_url(&mut demo);
@@ -239,12 +239,12 @@ fn the_stop_button_lands_the_vehicle() {
     let report = file.read();
     assert_eq!(report["outcome"], "landed", "{report:#}");
     assert!(report["reason"].as_str().unwrap().contains("stop"), "{report:#}");
-    // The touch-down is a motion, and no fault of the localization.
+    // The touch-down is a motion, not a fault of the localization.
     assert!(!demo.seen.iter().any(|line| line.contains("an outlier")), "{:#?}", demo.seen);
 }
 
 #[test]
-fn a_camera_changes_in_flight_and_the_plugin_flies_on() {
+fn plugin_flies_on_if_a_camera_changes_in_flight() {
     let file = ReportFile::new();
     let mut demo = file.demo(&["--seed", "7", "--seconds", "90"]);
     let url = page_url(&mut demo);
@@ -260,7 +260,7 @@ fn a_camera_changes_in_flight_and_the_plugin_flies_on() {
     assert!(response.starts_with("HTTP/1.1 400") && response.contains("near_m"), "{response}");
     let code = demo.wait(FLIGHT);
     let report = file.read();
-    // The example finds its way by each image's own description.
+    // The example plugin uses the intrinsics of each image.
     if !demo.has_finished(&report, code) {
         return;
     }
@@ -268,7 +268,7 @@ fn a_camera_changes_in_flight_and_the_plugin_flies_on() {
 }
 
 #[test]
-fn a_page_of_another_site_cannot_press_the_stop_button() {
+fn rejects_the_stop_button_of_another_site() {
     let file = ReportFile::new();
     let mut demo = file.demo(&[]);
     let url = page_url(&mut demo);
@@ -286,7 +286,7 @@ fn a_page_of_another_site_cannot_press_the_stop_button() {
 }
 
 #[test]
-fn an_interrupt_ends_every_process() {
+fn interrupt_ends_every_process() {
     let file = ReportFile::new();
     let mut demo = file.demo(&[]);
     demo.wait_for(FLYING, AIRBORNE);
@@ -296,7 +296,7 @@ fn an_interrupt_ends_every_process() {
     signal(demo.pid(), Signal::SIGINT);
     demo.wait(Duration::from_secs(20));
     println!("ended {:.2} s after the interrupt", start.elapsed().as_secs_f64());
-    // The guardian sees that the vehicle is gone by its silence.
+    // The guardian ends after the vehicle is silent.
     let deadline = Instant::now() + Duration::from_secs(20);
     let is_guardian = |pid: u32| {
         let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
@@ -344,10 +344,10 @@ fn two_demos_fly_side_by_side() {
 }
 
 #[test]
-fn a_captured_scene_is_rendered() {
+fn renders_a_captured_scene() {
     let scene = vizflyt_e2e::root().join("../shared/scenes/room.ply");
     if !scene.exists() {
-        println!("skipped: the captured room is not beside the repository");
+        println!("skipped: the captured room is not next to the repository");
         return;
     }
     let file = ReportFile::new();
@@ -358,9 +358,9 @@ fn a_captured_scene_is_rendered() {
     assert_ne!(report["outcome"], "error", "{report:#}");
 }
 
-/// A scene larger than memory, in small: drawn from the disk, with the trees where they are.
+/// Small model of a scene larger than memory: rendered from the disk, with the trees in their places.
 #[test]
-fn a_packed_scene_is_flown_in() {
+fn flies_in_a_packed_scene() {
     let file = ReportFile::new();
     let at = |name: &str| file.0.path().join(name).to_str().unwrap().to_owned();
     let (forest, packed) = (at("forest"), at("forest/forest.packed"));
@@ -377,7 +377,7 @@ fn a_packed_scene_is_flown_in() {
     name(r#"scene = { file = "forest.packed", up = "-y" }"#);
     check_refused(&["arena", "check", &arena], &["a packed scene lies where it was packed"]);
     name(r#"scene = "forest.packed""#);
-    // The shortest way round the obstacles is as long.
+    // The obstacles are the same: the shortest path around them has the same length.
     assert_eq!(good(&["arena", "check", &arena]), in_memory);
     check_refused(&["scene", "inspect", &packed], &["a packed scene", "that it was packed of"]);
 
@@ -387,7 +387,7 @@ fn a_packed_scene_is_flown_in() {
     assert!(report["renderer"].as_str().unwrap().ends_with("streamed"), "{report:#}");
     assert!(report["images_delivered"].as_u64().unwrap() > 100, "{report:#}");
     assert_ne!(report["outcome"], "error", "{report:#}");
-    // Judged from the log by the forest as it was made.
+    // The grader judges the log by the generated forest.
     let log = report["log"].as_str().unwrap();
     let verdict: Value =
         serde_json::from_str(&good(&["grade", "judge", log, "--seed=7", "--json"])).unwrap();

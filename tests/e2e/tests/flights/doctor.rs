@@ -1,11 +1,11 @@
-//! `vizflyt doctor vehicle` against the simulated autopilot: it names what is dangerous, and mends it.
+//! `vizflyt doctor vehicle` with the simulated autopilot: reports dangerous parameters, and corrects them.
 
 use std::process::{Command, Output};
 use std::time::Duration;
 
 use vizflyt_e2e::{Demo, vizflyt};
 
-/// A simulated autopilot with these parameters; returns the address to reach it.
+/// Starts a simulated autopilot with these parameters; returns its address.
 fn simulator(params: &[&str]) -> (Demo, String) {
     let mut command = Command::new(vizflyt());
     command.args(["sim", "--json", "--mavlink", "tcpin:127.0.0.1:0"]);
@@ -31,7 +31,7 @@ fn doctor(address: &str, more: &[&str]) -> (Output, String) {
 }
 
 #[test]
-fn dangers_are_named_and_mended() {
+fn reports_and_corrects_dangerous_parameters() {
     let (_simulator, address) =
         simulator(&["FS_GCS_ENABLE=1", "RTL_ALT_M=15", "BATT_MONITOR=0", "VISO_DELAY_MS=35"]);
     let (output, text) = doctor(&address, &[]);
@@ -46,7 +46,7 @@ fn dangers_are_named_and_mended() {
     ] {
         assert!(text.contains(expected), "no '{expected}' in:\n{text}");
     }
-    // Nothing was written.
+    // The first run must not write anything.
     let (_, again) = doctor(&address, &[]);
     assert_eq!(again, text);
 
@@ -65,7 +65,7 @@ fn dangers_are_named_and_mended() {
 }
 
 #[test]
-fn the_arena_becomes_the_autopilots_fence() {
+fn writes_the_arena_as_the_autopilots_fence() {
     let folder = tempfile::tempdir().unwrap();
     let scene = folder.path().join("room");
     let made = Command::new(vizflyt())
@@ -98,7 +98,7 @@ fn the_arena_becomes_the_autopilots_fence() {
 }
 
 #[test]
-fn a_missing_peer_is_reported_in_words() {
+fn reports_a_missing_peer() {
     let (output, text) = doctor("udpin:127.0.0.1:0", &[]);
     assert_eq!(output.status.code(), Some(1));
     assert!(text.contains("no heartbeat from an autopilot"), "{text}");
@@ -108,7 +108,7 @@ fn a_missing_peer_is_reported_in_words() {
 }
 
 #[test]
-fn a_key_is_made_once_and_given() {
+fn creates_a_signing_key_only_once() {
     let folder = tempfile::tempdir().unwrap();
     let key = folder.path().join("mavlink.key");
     let (_simulator, address) = simulator(&[]);

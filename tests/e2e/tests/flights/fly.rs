@@ -1,4 +1,4 @@
-//! `vizflyt new` and `vizflyt fly`, as a student uses them: the real binary, the simulated lab.
+//! `vizflyt new` and `vizflyt fly` as a student uses them: the real binary, the simulated lab.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -8,17 +8,17 @@ use serde_json::Value;
 use tempfile::TempDir;
 use vizflyt_e2e::{Demo, root, vizflyt};
 
-/// Loading, baking, arming and climbing, on a loaded machine.
+/// Timeout for loading, baking, arming and climbing on a loaded machine.
 const AIRBORNE: Duration = Duration::from_secs(90);
-/// A whole flight.
+/// Timeout for a complete flight.
 const FLIGHT: Duration = Duration::from_mins(4);
-/// Building a plugin and what it needs, on a loaded machine.
+/// Timeout for building a plugin with its dependencies on a loaded machine.
 const BUILT: Duration = Duration::from_mins(9);
 
-/// A student's project is compiled quickly rather than well: what is tested is that it builds and flies.
+/// A student's project is built without optimisation: the test is only about building and flying.
 const OPT_LEVEL: (&str, &str) = ("CARGO_PROFILE_RELEASE_OPT_LEVEL", "0");
 
-/// A folder of a student's.
+/// Temporary folder of a student.
 struct StudentFolder(TempDir);
 
 impl StudentFolder {
@@ -34,11 +34,11 @@ impl StudentFolder {
         std::fs::write(&path, text).unwrap();
         path
     }
-    /// `vizflyt ARGS`, with nothing of this computer's own settings.
+    /// Returns the command `vizflyt ARGS`, without this computer's settings.
     fn command(&self, args: &[&str]) -> Command {
         let mut command = Command::new(vizflyt());
         command.args(args).env("HOME", self.0.path()).env_remove("XDG_CONFIG_HOME");
-        // A student's project is built beside ours: what is the same is not built twice.
+        // The student's project uses our target folder, so that common dependencies are built once.
         command.env("CARGO_TARGET_DIR", vizflyt().ancestors().nth(2).unwrap());
         command.env(OPT_LEVEL.0, OPT_LEVEL.1);
         for folder in ["CARGO_HOME", "RUSTUP_HOME"] {
@@ -54,7 +54,7 @@ impl StudentFolder {
     fn run(&self, args: &[&str]) -> Output {
         self.command(args).current_dir(self.0.path()).output().unwrap()
     }
-    /// Runs, expects failure, and a last line of error that contains every part.
+    /// Runs a command that must fail, with an error line that contains every part.
     fn check_refused(&self, args: &[&str], parts: &[&str]) {
         let output = self.run(args);
         let message = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -67,7 +67,7 @@ impl StudentFolder {
             assert!(error.contains(part), "{args:?} does not contain {part:?}: {message}");
         }
     }
-    /// Starts a flight that writes a report here.
+    /// Starts a flight with its report in this folder.
     fn fly(&self, plugin: &Path, args: &[&str]) -> Demo {
         let mut command = self.command(&["fly", "--headless"]);
         command.arg(plugin).args(args);
@@ -99,7 +99,7 @@ fn a_new_rust_plugin_is_tested_and_flies() {
     assert_eq!(report["outcome"], "landed", "{report:#} {:#?}", flight.seen);
     assert_eq!(code, Some(0));
     assert!(report["mean_speed_mps"].as_f64().unwrap() > 0.1, "it moves: {report:#}");
-    // Its own test, without a vehicle.
+    // Run the project's own test, without a vehicle.
     let mut cargo = Command::new("cargo");
     cargo.args(["test", "--release", "-q"]).current_dir(&folder);
     cargo.env("CARGO_TARGET_DIR", vizflyt().ancestors().nth(2).unwrap());
@@ -109,7 +109,7 @@ fn a_new_rust_plugin_is_tested_and_flies() {
 }
 
 #[test]
-fn which_lab_it_is_stands_before_everything_else() {
+fn prints_the_kind_of_lab_first() {
     let student = StudentFolder::new();
     let fingerprint = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
     let config = student.write(
@@ -119,7 +119,7 @@ fn which_lab_it_is_stands_before_everything_else() {
              [vehicle]\nname = \"red\"\nmavlink = \"udpin:127.0.0.1:0\"\n[plugin]\npath = \"avoid\"\n"
         ),
     );
-    // The file in the folder where it is called, without being named.
+    // The configuration file of the working folder is used without an option.
     let output = student.run(&["fly", "--ready-within", "1"]);
     let output_text = String::from_utf8(output.stdout).unwrap();
     let first = output_text.lines().next().unwrap();
@@ -129,7 +129,7 @@ fn which_lab_it_is_stands_before_everything_else() {
     assert!(!output.status.success());
     assert!(output_text.contains("error: not in the air after 1 s"), "{output_text}");
 
-    // The same file, and the simulated lab all the same.
+    // With the same file and `--sim`: the simulated lab.
     let mut flight = student.fly(
         Path::new("avoid"),
         &["--config", text(&config), "--sim", "--scene", "room", "--seconds", "2"],
@@ -141,9 +141,9 @@ fn which_lab_it_is_stands_before_everything_else() {
 }
 
 #[test]
-fn a_saved_plugin_takes_over_while_the_vehicle_holds() {
+fn reloads_a_saved_plugin_while_the_vehicle_holds() {
     let student = StudentFolder::new();
-    // A program that can be saved: the built-in example, under a name of its own.
+    // A program that can be saved: a script that starts the built-in example.
     let save = |version: &str| {
         let text =
             format!("#!/bin/sh\n# {version}\nexec {} plugin avoid \"$@\"\n", text(&vizflyt()));
@@ -169,7 +169,7 @@ fn a_saved_plugin_takes_over_while_the_vehicle_holds() {
 }
 
 #[test]
-fn a_new_python_plugin_has_all_that_it_needs_but_the_package() {
+fn new_python_plugin_is_complete_except_for_the_package() {
     let student = StudentFolder::new();
     let made = student.run(&["new", "first"]);
     assert!(made.status.success());
@@ -185,7 +185,7 @@ fn a_new_python_plugin_has_all_that_it_needs_but_the_package() {
         required.starts_with(&format!("vizflyt=={}\n", env!("CARGO_PKG_VERSION"))),
         "{required}"
     );
-    // A Python without the package: what is missing, and the command that brings it.
+    // With a Python without the package, the error names the missing package and the command to install it.
     let python = student.write(
         "first/.venv/bin/python3",
         "#!/bin/sh\necho \"ModuleNotFoundError: No module named 'vizflyt'\" >&2\nexit 1\n",
@@ -196,7 +196,7 @@ fn a_new_python_plugin_has_all_that_it_needs_but_the_package() {
 }
 
 #[test]
-fn mistakes_are_explained() {
+fn errors_name_the_remedy() {
     let student = StudentFolder::new();
     student.check_refused(&["fly"], &["no plugin given", "[plugin]"]);
     student.check_refused(&["fly", "./none"], &["no plugin at ./none", "vizflyt new", "avoid"]);

@@ -1,6 +1,6 @@
-//! The guardian as a process, between a runtime and an autopilot that are played by the test: what ends a runtime
-//! does not end it, it lands what is in the air, and it leaves when nothing is left to do. What it adds to the way
-//! of a packet is printed: `cargo test -p vizflyt-e2e --test flights guardian -- --nocapture`.
+//! The guardian's process between a runtime and an autopilot, both played by the test: it survives signals that end a
+//! runtime, lands a flying vehicle, and ends when there is nothing left to do. Its latency is printed: `cargo test -p
+//! vizflyt-e2e --test flights guardian -- --nocapture`.
 
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
@@ -19,7 +19,7 @@ use vizflyt_protocol::messages::YawTarget;
 
 const GUIDED: u32 = 4;
 const LAND: u32 = 9;
-/// Anything here ends within this, however loaded the machine is.
+/// Timeout, for any load of the machine.
 const PATIENCE: Duration = Duration::from_mins(1);
 
 fn packet(source: (u8, u8), message: &MavMessage) -> Vec<u8> {
@@ -46,7 +46,7 @@ fn setpoint() -> Vec<u8> {
     packet((255, 191), &MavMessage::SET_POSITION_TARGET_LOCAL_NED(message))
 }
 
-/// A guardian, and the autopilot's end of its port.
+/// Starts a guardian; returns it and the autopilot's end of its port.
 fn start() -> (Guardian, UdpSocket) {
     let address = "udpin:127.0.0.1:0".parse().unwrap();
     let guardian = Guardian::start(&vizflyt(), &address, &Wanted::default()).unwrap();
@@ -76,7 +76,7 @@ fn until(autopilot: &UdpSocket, id: u32) {
 }
 
 #[test]
-fn it_outlives_what_ends_a_runtime_and_leaves_when_the_vehicle_stands() {
+fn survives_signals_and_ends_after_the_landing() {
     let (guardian, autopilot) = start();
     let pid = Pid::from_raw(guardian.pid().cast_signed());
     for _ in 0..20 {
@@ -88,9 +88,9 @@ fn it_outlives_what_ends_a_runtime_and_leaves_when_the_vehicle_stands() {
         guardian.send(&setpoint());
     }
     until(&autopilot, 84);
-    // The runtime ends in flight: LAND at once, and it stays.
+    // The runtime ends in flight: the guardian sends LAND at once, and continues.
     guardian.leave();
-    // We have left it: that it ends is no loss to tell of.
+    // After `leave`, the end of the guardian is not an error.
     let mut buffer = BUFFER;
     assert!(matches!(guardian.receive(&mut buffer), Ok(None)));
     until(&autopilot, 76);
@@ -105,16 +105,16 @@ fn it_outlives_what_ends_a_runtime_and_leaves_when_the_vehicle_stands() {
 }
 
 #[test]
-fn a_port_that_is_taken_is_told_and_no_process_is_left() {
+fn reports_a_port_in_use_and_leaves_no_process() {
     let taken = UdpSocket::bind("127.0.0.1:0").unwrap();
     let address = format!("udpin:{}", taken.local_addr().unwrap()).parse().unwrap();
     let error = Guardian::start(&vizflyt(), &address, &Wanted::default()).unwrap_err().to_string();
     assert!(error.contains("in use") && error.contains("guardian of an earlier flight"), "{error}");
 }
 
-/// Prints, and judges nothing by time.
+/// Prints the latency, without a limit.
 #[test]
-fn its_part_of_a_packets_way_is_measured() {
+fn measures_its_latency() {
     const PACKETS: usize = 2000;
     let (guardian, autopilot) = start();
     let direct = UdpSocket::bind("127.0.0.1:0").unwrap();

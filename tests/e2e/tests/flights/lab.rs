@@ -1,9 +1,8 @@
-//! A lab in which several plugins fly at once: one render server, and for each flight a simulated
-//! vehicle and a runtime, all real processes. The motion capture's packets and the vehicle's MAVLink go
-//! through this test on their way, so it sees where each vehicle is, whatever the runtime reports, and
-//! can cut either.
+//! A lab for several simultaneous flights: one render server, and for each flight a simulated vehicle and a runtime,
+//! all real processes. The motion capture's packets and the vehicle's MAVLink pass through this test. It therefore
+//! knows the position of each vehicle independently of the runtime, and can cut both links.
 //!
-//! Of `misbehave`, `linkloss` and `chain`: what one does not use, another does.
+//! Used by `misbehave`, `linkloss` and `chain`; none uses everything.
 
 #![allow(dead_code)]
 
@@ -34,72 +33,72 @@ pub(crate) struct Lab {
     quic: String,
     fingerprint: Fingerprint,
     vicon: String,
-    /// Numbers the packets of all vehicles, as one motion capture does.
+    /// Packet counter of all vehicles, as in one motion capture.
     packets: Arc<AtomicU32>,
 }
 
-/// What can be cut between the vehicle and the rest; set to cut.
+/// Links of the vehicle that can be cut; true means cut.
 #[derive(Default)]
 pub(crate) struct Cuts {
     /// Poses from the motion capture to the server.
     pub poses: AtomicBool,
-    /// MAVLink, both ways.
+    /// MAVLink in both directions.
     pub mavlink: AtomicBool,
 }
 
-/// What a flight is to be.
+/// Settings of a flight.
 #[derive(Clone, Copy, Default)]
 pub(crate) struct Plan<'a> {
-    /// What is asked of the plugin.
+    /// Request to the plugin.
     pub how: &'static str,
     /// Lines of jetson.toml under `[plugin]`; other tables may follow.
     pub settings: &'a str,
-    /// More arguments for the runtime.
+    /// Additional arguments for the runtime.
     pub more: &'a [&'a str],
-    /// More arguments for the simulated vehicle, before the link that the runtime is on.
+    /// Additional arguments for the simulated vehicle, before the runtime's link.
     pub vehicle: &'a [&'a str],
-    /// Whether its MAVLink goes through an emulated bridge.
+    /// MAVLink goes through an emulated bridge.
     pub bridge: bool,
 }
 
 /// An emulated bridge.
 struct Bridge {
     process: Process,
-    /// Its arguments.
+    /// Arguments of the process.
     args: Vec<String>,
-    /// What names its end of the serial line.
+    /// Path of its end of the serial line.
     uart: PathBuf,
 }
 
-/// One flight, while it lasts.
+/// A running flight.
 pub(crate) struct Flight {
-    /// What was asked of the plugin.
+    /// Request to the plugin.
     pub how: &'static str,
     simulator: Process,
-    /// The simulator's `ready` line.
+    /// `ready` line of the simulator.
     vehicle: Value,
     bridge: Option<Bridge>,
     runtime: Process,
     track: Track,
-    /// Modes in the vehicle's own heartbeats.
+    /// Modes from the vehicle's own heartbeats.
     modes: Modes,
-    /// When the runtime commanded to land.
+    /// Times of the runtime's LAND commands.
     lands: Lands,
-    /// Poses that the guardian sent by itself.
+    /// Number of poses sent by the guardian.
     guardian_poses: Arc<AtomicU32>,
     cuts: Arc<Cuts>,
-    /// Sends to the vehicle what goes round the runtime.
+    /// Link to the vehicle that bypasses the runtime.
     aside: Aside,
     report: PathBuf,
 }
 
-/// What was seen of a flight.
+/// Observations of a flight.
 pub(crate) struct Seen {
-    /// JSON lines of the runtime, and when each came.
+    /// JSON lines of the runtime, with their times.
     pub lines: Vec<(Instant, Value)>,
     /// Positions by motion capture, also while its poses are cut. [m, world]
     pub track: Vec<Sight>,
-    /// Modes of the vehicle, and when each began.
+    /// Modes of the vehicle, with their start.
     pub modes: Vec<(Instant, u32)>,
     /// The runtime's report.
     pub report: Value,
@@ -108,11 +107,11 @@ pub(crate) struct Seen {
 /// One pose of the motion capture.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sight {
-    /// When it came.
+    /// Time of arrival.
     pub at: Instant,
-    /// When it was true, on the simulator's clock. [s]
+    /// Time of the measurement on the simulator's clock. [s]
     pub stamp_s: f64,
-    /// Where the vehicle was. [m, world]
+    /// Position of the vehicle. [m, world]
     pub p_m: DVec3,
 }
 
@@ -120,19 +119,19 @@ type Track = Arc<Mutex<Vec<Sight>>>;
 type Modes = Arc<Mutex<Vec<(Instant, u32)>>>;
 type Lands = Arc<Mutex<Vec<Instant>>>;
 
-/// A way to the vehicle beside the runtime's.
+/// A link to the vehicle in parallel to the runtime's.
 struct Aside {
     socket: UdpSocket,
     vehicle: Arc<Mutex<Option<SocketAddr>>>,
 }
 
-/// Where poses come from, unless a test says otherwise; the last table of arena.toml.
+/// Default source of poses, in the format of arena.toml's last table.
 pub(crate) const LOCALIZATION: &str =
     "\n[[localization]]\ndriver = \"vicon\"\naddress = \"127.0.0.1:0\"\n";
-/// Anything here ends within this, however loaded the machine is.
+/// Timeout, for any load of the machine.
 const PATIENCE: Duration = Duration::from_mins(2);
 
-/// A child that prints JSON lines; killed when dropped.
+/// A child process that prints JSON lines; killed when dropped.
 struct Process {
     child: Child,
     lines: Receiver<(Instant, Value)>,
@@ -177,14 +176,14 @@ impl Drop for Process {
 }
 
 impl Lab {
-    /// Starts a server of a room for these vehicles.
+    /// Starts a server with a room and these vehicles.
     pub(crate) fn open(vehicles: usize) -> Self {
         Self::open_with(vehicles, LOCALIZATION)
     }
 
-    /// Starts a server of a room for these vehicles, with more tables of its arena.toml.
+    /// Starts a server with a room and these vehicles, with additional tables in its arena.toml.
     pub(crate) fn open_with(vehicles: usize, tables: &str) -> Self {
-        // A fence that is soon reached: the flights are short.
+        // Put the fence near the start: the flights are short.
         Self::open_in(vehicles, |folder| {
             let arena = folder.join("arena.toml");
             let text = fs::read_to_string(&arena).unwrap();
@@ -196,10 +195,10 @@ impl Lab {
         })
     }
 
-    /// Starts a server of a room that `furnish` has changed, in its folder, for these vehicles.
+    /// Starts a server with a room and these vehicles; `furnish` changes the room's folder.
     pub(crate) fn open_in(vehicles: usize, furnish: impl FnOnce(&Path)) -> Self {
         let folder = tempfile::tempdir().unwrap();
-        // The plugins run as another user where this is root.
+        // If this is root, the plugins run as another user.
         let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
         fs::set_permissions(folder.path(), mode).unwrap();
         let at = |name: &str| folder.path().join(name);
@@ -208,7 +207,7 @@ impl Lab {
             Command::new(vizflyt()).args(["scene", "generate", "room", "-o", &scene]).output();
         assert!(made.unwrap().status.success());
         furnish(&at("scene"));
-        // Small images: several vehicles fly on one computer.
+        // Small images, because several vehicles fly on one computer.
         let arena = at("scene").join("arena.toml");
         let text = fs::read_to_string(&arena).unwrap();
         let text = text
@@ -232,7 +231,7 @@ impl Lab {
         args.push(arena.to_str().unwrap().to_owned());
         args.push(format!("--keys={}", at("server").display()));
         args.push("--leaderboard=none".into());
-        // They all start at one place, each in a net of its own.
+        // All vehicles start at one place, each in its own net.
         args.push("--apart".into());
         args.extend(names.iter().map(|name| format!("--vehicle={name}")));
         let server = Process::start(&vizflyt(), &args);
@@ -248,7 +247,7 @@ impl Lab {
         let name = name(index);
         let at = |kind: &str| self.folder.path().join(format!("{name}-{kind}"));
         let config = at("jetson.toml");
-        // Which misdeeds are left to do, for a plugin that is started again: its user writes it.
+        // Remaining faults, for a plugin that is restarted; the plugin's user writes this folder.
         let left = at("left");
         let _ = fs::remove_dir_all(&left);
         fs::create_dir(&left).unwrap();
@@ -314,14 +313,14 @@ impl Lab {
         }
     }
 
-    /// Returns an address whose packets are passed on to the server, and noted.
+    /// Returns an address whose packets are recorded and forwarded to the server.
     fn capture(&self, track: Track, cuts: Arc<Cuts>) -> SocketAddr {
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         let address = socket.local_addr().unwrap();
         let (server, packets) = (self.vicon.clone(), Arc::clone(&self.packets));
         thread::spawn(move || {
             let mut packet = [0; 512];
-            // Until the process ends: packets of a vehicle that is gone do not come.
+            // Runs until the process ends.
             while let Ok(len) = socket.recv(&mut packet) {
                 let frame = u32::from_le_bytes(packet[..4].try_into().unwrap());
                 let number = packets.fetch_add(1, Ordering::Relaxed);
@@ -329,7 +328,7 @@ impl Lab {
                 if !cuts.poses.load(Ordering::Relaxed) {
                     let _ = socket.send_to(&packet[..len], &server);
                 }
-                // Vicon's object stream: after the name three doubles in millimetres.
+                // Vicon's object stream: three doubles in millimetres follow the name.
                 let mm = |axis: usize| {
                     let at = 32 + 8 * axis;
                     f64::from_le_bytes(packet[at..at + 8].try_into().unwrap())
@@ -348,14 +347,14 @@ impl Lab {
         let _ = self.server.child.wait();
     }
 
-    /// Whether the server still runs.
+    /// Returns whether the server still runs.
     pub(crate) fn lives(&mut self) -> bool {
         self.server.child.try_wait().unwrap().is_none()
     }
 }
 
 impl Flight {
-    /// Waits until the runtime prints a line that contains `text`; returns what it printed.
+    /// Waits until the runtime prints a line that contains `text`; returns all lines up to it.
     pub(crate) fn until(&mut self, text: &str) -> Vec<(Instant, Value)> {
         let mut lines = Vec::new();
         let deadline = Instant::now() + PATIENCE;
@@ -372,22 +371,22 @@ impl Flight {
         }
     }
 
-    /// What can be cut.
+    /// Returns the links that can be cut.
     pub(crate) fn cuts(&self) -> &Cuts {
         &self.cuts
     }
 
-    /// Kills the runtime; its plugin goes with it, its guardian does not.
+    /// Kills the runtime and its plugin, but not its guardian.
     pub(crate) fn kill_runtime(&mut self) {
         let _ = self.runtime.child.kill();
     }
 
-    /// Stops the runtime, as one that hangs.
+    /// Stops the runtime, as if it hangs.
     pub(crate) fn stop_runtime(&self) {
         let _ = kill(Pid::from_raw(self.runtime.child.id().cast_signed()), Signal::SIGSTOP);
     }
 
-    /// Kills the runtime and its guardian: the Jetson is off.
+    /// Kills the runtime and its guardian, as if the Jetson were off.
     pub(crate) fn switch_off(&mut self) {
         let runtime = self.runtime.child.id();
         let children = format!("/proc/{runtime}/task/{runtime}/children");
@@ -402,22 +401,22 @@ impl Flight {
         let _ = self.runtime.child.kill();
     }
 
-    /// Stops the bridge, as one that hangs.
+    /// Stops the bridge, as if it hangs.
     pub(crate) fn stop_bridge(&self) {
         let bridge = self.bridge.as_ref().expect("it flies through a bridge");
         let _ = kill(Pid::from_raw(bridge.process.child.id().cast_signed()), Signal::SIGSTOP);
     }
 
-    /// Kills the bridge, as a power cut does; a serial device goes with it.
+    /// Kills the bridge like a power cut, and removes its serial device.
     pub(crate) fn kill_bridge(&mut self) {
         let bridge = self.bridge.as_mut().expect("it flies through a bridge");
         let _ = bridge.process.child.kill();
         let _ = bridge.process.child.wait();
-        // The kernel gives its number to the next pseudo-terminal, which is another vehicle's.
+        // The kernel gives its number to the next pseudo-terminal, which belongs to another vehicle.
         let _ = fs::remove_file(&bridge.uart);
     }
 
-    /// Starts the bridge anew.
+    /// Restarts the bridge.
     pub(crate) fn restart_bridge(&mut self) {
         let bridge = self.bridge.as_mut().expect("it flies through a bridge");
         bridge.process = Process::start(&vizflyt(), &bridge.args);
@@ -440,18 +439,18 @@ impl Flight {
         }
     }
 
-    /// Sends a packet to the vehicle that the runtime knows nothing of.
+    /// Sends a packet to the vehicle, bypassing the runtime.
     pub(crate) fn tell_vehicle(&self, packet: &[u8]) {
         let vehicle = lock(&self.aside.vehicle).expect("the vehicle has sent a packet");
         self.aside.socket.send_to(packet, vehicle).unwrap();
     }
 
-    /// Returns when the runtime first commanded to land, if it has.
+    /// Returns the time of the runtime's first LAND command, if any.
     pub(crate) fn ordered_to_land(&self) -> Option<Instant> {
         lock(&self.lands).first().copied()
     }
 
-    /// Returns how many poses the guardian has sent by itself.
+    /// Returns the number of poses that the guardian has sent.
     pub(crate) fn guardian_poses(&self) -> u32 {
         self.guardian_poses.load(Ordering::Relaxed)
     }
@@ -461,12 +460,12 @@ impl Flight {
         *lock(&self.track).last().expect("the motion capture runs")
     }
 
-    /// Returns what has been seen so far, without waiting for the runtime.
+    /// Returns the observations so far, without waiting for the runtime.
     pub(crate) fn so_far(&self) -> (Vec<Sight>, Vec<(Instant, u32)>) {
         (lock(&self.track).clone(), lock(&self.modes).clone())
     }
 
-    /// Waits for the end of the flight; returns what was seen of it.
+    /// Waits for the end of the flight; returns the observations.
     pub(crate) fn wait(mut self) -> Seen {
         let mut lines = Vec::new();
         let deadline = Instant::now() + PATIENCE;
@@ -488,18 +487,18 @@ impl Flight {
 }
 
 impl Seen {
-    /// Returns when the runtime first printed a line that contains `text`.
+    /// Returns the time of the runtime's first line that contains `text`.
     pub(crate) fn when(&self, text: &str) -> Option<Instant> {
         let line = self.lines.iter().find(|(_, line)| line.to_string().contains(text));
         line.map(|&(at, _)| at)
     }
 
-    /// Returns how many events and plugin lines contain `text`.
+    /// Returns the number of events and plugin lines that contain `text`.
     pub(crate) fn count(&self, text: &str) -> usize {
         self.lines.iter().filter(|(_, line)| line.to_string().contains(text)).count()
     }
 
-    /// Returns the vehicle's speed around `at`, over a fifth of a second. [m/s]
+    /// Returns the vehicle's speed after `at`, over 0.2 s. [m/s]
     fn speed_mps(&self, at: Instant) -> f64 {
         let near = |at: Instant| self.track.iter().find(|sight| sight.at >= at);
         let (Some(a), Some(b)) = (near(at), near(at + Duration::from_millis(200))) else {
@@ -509,8 +508,7 @@ impl Seen {
         if seconds > 0.0 { (b.p_m - a.p_m).length() / seconds } else { 0.0 }
     }
 
-    /// Returns how long after `since` the vehicle first stood still or came straight down; `None`
-    /// if it never did.
+    /// Returns the time from `since` until the vehicle first stopped or only descended; `None` if it never did.
     pub(crate) fn stopped_after(&self, since: Instant) -> Option<Duration> {
         let level = |at: Instant| {
             let near = |at: Instant| self.track.iter().find(|sight| sight.at >= at);
@@ -522,7 +520,7 @@ impl Seen {
         (0..200).map(|n| Duration::from_millis(50) * n).find(|&after| level(since + after) < 0.15)
     }
 
-    /// Returns the height at the end, and the speed. [m; m/s]
+    /// Returns height and speed at the end. [m; m/s]
     pub(crate) fn end(&self) -> (f64, f64) {
         let Some(&Sight { at, p_m, .. }) = self.track.last() else {
             return (f64::NAN, f64::NAN);
@@ -532,8 +530,7 @@ impl Seen {
     }
 }
 
-/// Carries MAVLink between a vehicle, which sends to the address returned, and the runtime at
-/// `runtime`.
+/// Forwards MAVLink between a vehicle, which sends to the returned address, and the runtime at `runtime`.
 fn carry(
     runtime: String,
     (modes, lands, guardian_poses): (Modes, Lands, Arc<AtomicU32>),
@@ -547,12 +544,12 @@ fn carry(
     let is_open = move |cuts: &Cuts| !cuts.mavlink.load(Ordering::Relaxed);
     let (from_runtime, up) = (to_runtime.try_clone().unwrap(), to_vehicle.try_clone().unwrap());
     let (known, open) = (Arc::clone(&vehicle), Arc::clone(&cuts));
-    // Both until the process ends: a packet of a vehicle or runtime that is gone does not come.
+    // Both threads run until the process ends.
     thread::spawn(move || {
         let mut packet = [0; 2048];
         let mut decoder = StreamDecoder::default();
         loop {
-            // A runtime that is gone reports itself as refused: go on.
+            // A runtime that has ended causes a connection error: continue.
             let Ok(len) = from_runtime.recv(&mut packet) else { continue };
             decoder.push(&packet[..len], |packet| match packet.message {
                 MavMessage::COMMAND_LONG(command)
@@ -593,9 +590,9 @@ fn carry(
     (address, aside)
 }
 
-/// The guardian's component: its packets are not the runtime's.
+/// Component id of the guardian.
 const GUARDIAN: u8 = 192;
-/// The simulated motion capture's rate. [Hz]
+/// Rate of the simulated motion capture. [Hz]
 const CAPTURE_HZ: f64 = 200.0;
 
 fn name(index: usize) -> String {

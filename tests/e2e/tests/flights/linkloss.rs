@@ -1,6 +1,6 @@
-//! The losses of a process, with real processes in real time: whoever is left lands the vehicle inside the fence. The
-//! vehicle is watched from outside, by the motion capture's own packets. How soon it is down and how far it drifts is
-//! held by `tables::failsafe`, which flies every loss on a virtual clock.
+//! Loss of a process, with real processes in real time: the remaining ones land the vehicle inside the fence. The
+//! vehicle is observed from outside, by the motion capture's packets. Limits on landing time and drift are tested by
+//! `tables::failsafe`, which flies every loss on a virtual clock.
 
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
@@ -10,26 +10,26 @@ use glam::Vec3;
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_splat::{format, ply};
 
-/// Lost process, and who notices.
+/// Lost process, and the reaction.
 #[derive(Clone, Copy, Debug)]
 enum Loss {
     /// The runtime is killed: the guardian lands at once.
     RuntimeKilled,
-    /// The runtime is stopped, as one that hangs: the guardian lands after 0.5 s.
+    /// The runtime is stopped, as if it hangs: the guardian lands after 0.5 s.
     RuntimeStopped,
     /// The server is killed: the runtime lands after 0.5 s.
     ServerKilled,
 }
 
-/// What is asked of the plugin, and how fast it then flies. [m/s]
+/// Request to the plugin, and the resulting speed. [m/s]
 const SPEED: (&str, f64) = ("world:1:0", 1.0);
-/// Down means this near the floor. [m]
+/// Maximum height of a vehicle that is down. [m]
 const DOWN_M: f64 = 0.05;
 /// The room's fence. [m, world]
 const FENCE_X_M: (f64, f64) = (0.0, 11.0);
-/// By the guardian's own feed, until the vehicle is down: it sends 50 a second, on a machine with nothing else to do.
+/// Minimum number of the guardian's poses until the vehicle is down: 50 per second on an idle machine.
 const GUARDIAN_POSES: u32 = 10;
-/// A limit on waiting; nothing takes half as long.
+/// Timeout, more than twice of what any wait needs.
 const PATIENCE: Duration = Duration::from_mins(2);
 
 #[test]
@@ -43,7 +43,7 @@ fn vehicle_lands_after_the_loss_of_a_process() {
     check_lands(&Mutex::new(open(1)), 0, Loss::ServerKilled);
 }
 
-/// Opens a lab whose room is free from end to end: nothing is hit, no goal is reached.
+/// Opens a lab with an empty room: no collision, and the goal is not reached.
 fn open(vehicles: usize) -> Lab {
     Lab::open_in(vehicles, |folder| {
         let path = folder.join("scene.ply");
@@ -64,7 +64,7 @@ fn open(vehicles: usize) -> Lab {
     })
 }
 
-/// Strikes a vehicle that flies at its speed: it must land, inside the fence.
+/// Causes the loss for a flying vehicle: it must land inside the fence.
 fn check_lands(lab: &Mutex<Lab>, index: usize, loss: Loss) {
     let parameters = vizflyt_e2e::airframe_parameters();
     let vehicle: Vec<String> =
@@ -73,22 +73,22 @@ fn check_lands(lab: &Mutex<Lab>, index: usize, loss: Loss) {
     let vehicle: Vec<&str> = vehicle.iter().map(String::as_str).chain(["--radio"]).collect();
     let (how, speed_mps) = SPEED;
     let plan = Plan { how, vehicle: &vehicle, ..Plan::default() };
-    let mut flight = lab.lock().expect("nobody panics with it").fly(index, plan);
+    let mut flight = lab.lock().expect("no thread panics with the lock").fly(index, plan);
     flight.until("\"phase\":\"flying\"");
     let start = flight.now().p_m;
     let way_m = speed_mps.mul_add(1.2, 0.2);
-    wait(loss, "its way", || (flight.now().p_m - start).truncate().length() > way_m);
+    wait(loss, "its path", || (flight.now().p_m - start).truncate().length() > way_m);
     let last_good = flight.now();
     match loss {
         Loss::RuntimeKilled => flight.kill_runtime(),
         Loss::RuntimeStopped => flight.stop_runtime(),
-        Loss::ServerKilled => lab.lock().expect("nobody panics with it").kill_server(),
+        Loss::ServerKilled => lab.lock().expect("no thread panics with the lock").kill_server(),
     }
     wait(loss, "the floor", || flight.now().p_m.z < DOWN_M);
     check_landed(&flight, loss, last_good.at);
 }
 
-/// Checks that LAND was entered after the loss, and the fence never left.
+/// Asserts that LAND was entered after the loss, and that the vehicle never left the fence.
 fn check_landed(flight: &Flight, loss: Loss, lost_at: Instant) {
     let (track, modes) = flight.so_far();
     let land = CopterMode::Land as u32;

@@ -1,5 +1,5 @@
-//! `vizflyt doctor localization` while a simulated hand carries the vehicle about: it names the setting
-//! that is wrong, and finds nothing where none is.
+//! `vizflyt doctor localization` while a simulated hand carries the vehicle: it names a wrong setting, and reports no
+//! fault if all are right.
 
 use std::net::UdpSocket;
 use std::process::Command;
@@ -7,23 +7,23 @@ use std::time::Duration;
 
 use vizflyt_e2e::{Demo, vizflyt};
 
-/// Five motions of three seconds, twice if the first was not seen from its beginning, on a busy machine.
+/// Timeout: five motions of three seconds, twice if a busy machine missed the start of the first.
 const CHECKED: Duration = Duration::from_mins(2);
 
-/// Returns an address that nobody uses.
+/// Returns a free address.
 fn free() -> String {
     UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string()
 }
 
-/// Lets the hand carry the vehicle before a motion capture of this `format`, and the doctor look at it
-/// as `settings` say; returns whether it finds no fault, and its output.
+/// Simulates a hand that carries the vehicle in a motion capture of this `format`, and runs the doctor with `settings`.
+/// Returns whether it reports no fault, and its output.
 fn doctor(format: &str, settings: &str, within: &str) -> (bool, String) {
     let address = free();
     let mut doctor = Command::new(vizflyt());
     doctor.args(["doctor", "localization", "--within", within]);
     doctor.args(["--pose", &format!("{format}:{address}{settings}")]);
     let mut doctor = Demo::spawn(&mut doctor);
-    // By then its socket is there; the hand begins with the vehicle on the floor.
+    // Its socket is open now; the hand starts with the vehicle on the floor.
     doctor.wait_for("listens", CHECKED);
     let mut simulator = Command::new(vizflyt());
     simulator.args(["sim", "--json", "--hand", "--spawn=1,2,0,20", "--mavlink=udpout:127.0.0.1:9"]);
@@ -33,7 +33,7 @@ fn doctor(format: &str, settings: &str, within: &str) -> (bool, String) {
     (code == Some(0), doctor.seen.join("\n"))
 }
 
-/// Carries a vehicle for each case, all at once: a hand and its doctor mostly wait.
+/// Carries a vehicle for each case, all in parallel: a hand and its doctor mostly wait.
 fn check(cases: &[(&str, &str, &[&str])]) {
     std::thread::scope(|scope| {
         for (format, settings, expected) in cases {
@@ -52,7 +52,7 @@ fn check_one(format: &str, settings: &str, expected: &[&str]) {
 }
 
 #[test]
-fn motive_s_up_axis_is_found() {
+fn finds_motives_up_axis() {
     check(&[
         ("natnet", "", &["lifted, it went along +y, not up", "set      up = \"y\""]),
         ("natnet", ",up=y", &["up is +z", "right    axes"]),
@@ -60,7 +60,7 @@ fn motive_s_up_axis_is_found() {
 }
 
 #[test]
-fn wrong_units_orders_and_mirrors_are_found() {
+fn finds_wrong_units_orders_and_mirrors() {
     check(&[
         ("json", ",units=mm", &["it went 0.50 mm", "set      units = \"m\""]),
         ("json", ",axes=x-yz", &["it turned right by", "set      axes = \"xyz\""]),
@@ -69,9 +69,9 @@ fn wrong_units_orders_and_mirrors_are_found() {
     ]);
 }
 
-/// The autopilot's gyroscope feels the hand, and the motion capture shows it later.
+/// The autopilot's gyroscope measures the hand's motion, and the motion capture shows it later.
 #[test]
-fn the_delay_of_the_poses_is_measured() {
+fn measures_the_delay_of_the_poses() {
     for (delay_ms, set) in [(80, ""), (40, ",latency_ms=40")] {
         let (address, mavlink) = (free(), free());
         let mut doctor = Command::new(vizflyt());
@@ -96,9 +96,9 @@ fn the_delay_of_the_poses_is_measured() {
     }
 }
 
-/// A whole flight whose poses come as Motive streams them; and its log as a source of poses.
+/// A complete flight with poses in Motive's format; then its log is a source of poses.
 #[test]
-fn the_forest_is_flown_on_natnet_and_its_log_is_a_source() {
+fn flies_the_forest_with_natnet_and_replays_its_poses() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name).display().to_string();
     let (report, log) = (at("report.json"), at("flights"));
@@ -136,7 +136,7 @@ fn the_forest_is_flown_on_natnet_and_its_log_is_a_source() {
 }
 
 #[test]
-fn a_vehicle_with_another_name_is_reported() {
+fn reports_a_vehicle_with_another_name() {
     let (is_content, text) = doctor("json", ",objects.vizflyt=wasp", "10");
     assert!(!is_content);
     assert!(text.contains("object 'vizflyt' streams, but 'wasp' was asked for"), "{text}");

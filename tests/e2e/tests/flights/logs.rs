@@ -1,4 +1,4 @@
-//! Flight logs of the real program: replayed to the example, which answers as in flight.
+//! Flight logs of the real program: the example plugin gives the same replies in a replay as in flight.
 
 use std::path::Path;
 use std::time::Duration;
@@ -18,7 +18,7 @@ fn replay(log: &str, answers: &Path, more: &[&str]) -> Value {
 }
 
 #[test]
-fn a_flight_is_replayed_bit_by_bit() {
+fn replays_a_flight_bit_by_bit() {
     let folder = tempfile::tempdir().unwrap();
     let flights = folder.path().join("flights");
     let folder_of_logs = flights.to_str().unwrap();
@@ -41,7 +41,7 @@ fn a_flight_is_replayed_bit_by_bit() {
     let count = |key: &str| found[key].as_u64().unwrap();
     assert_eq!(count("images_left_out"), 0, "{found:#}");
     assert!(count("compared") > 50 && found["plugin_failed"].is_null(), "{found:#}");
-    // A log that dropped images cannot give a plugin with a memory the same past.
+    // If the log lacks images, a plugin with memory may reply differently.
     assert!(count("differ") == 0 || count("images_missing") > 0, "{found:#}");
     replay(log, &two, &[]);
     assert_eq!(std::fs::read(&one).unwrap(), std::fs::read(&two).unwrap(), "byte by byte");

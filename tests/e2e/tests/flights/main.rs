@@ -1,4 +1,5 @@
-//! Black-box flights: the real programs, in real time. One program, because each one links both halves of the system.
+//! Black-box flights with the real programs in real time. One test program, because each links both halves of the
+//! system.
 
 mod bridge;
 mod chain;

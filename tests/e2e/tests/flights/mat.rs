@@ -1,5 +1,5 @@
-//! The room is flown with a webcam under the vehicle over a mat of tags, and nothing else to localize it; the pose that
-//! everything flies by is held against the truth, which comes from the simulator by a way of its own.
+//! Flights in the room localized only by a webcam under the vehicle over a mat of tags. The fused pose is compared with
+//! the simulator's true pose, which is sent separately.
 
 use std::fs::File;
 use std::net::UdpSocket;
@@ -13,21 +13,21 @@ use serde_json::Value;
 use vizflyt_e2e::{Demo, check_refused};
 use vizflyt_runtime::log::read::{Entry, LogReader, RecordedPoses};
 
-/// A whole flight, on a loaded machine.
+/// Timeout for a complete flight on a loaded machine.
 const FLIGHT: Duration = Duration::from_mins(4);
-/// Below this height the vehicle takes off and lands: no large tag is seen as a whole. [m]
+/// Height of take-off and landing, in which no large tag is completely visible. [m]
 const LOW_M: f64 = 0.4;
-/// A vehicle that stands is no higher. [m]
+/// Maximum height of a standing vehicle. [m]
 const STANDS_M: f64 = 0.02;
 
-/// Where the vehicle truly was, on the clock that poses are stamped by.
+/// True poses of the vehicle, on the clock of the pose stamps.
 struct Truth {
     stamps_ns: Vec<u64>,
     poses: Vec<(DVec3, DQuat)>,
 }
 
 impl Truth {
-    /// Returns the pose at an instant.
+    /// Returns the pose at a time.
     fn at(&self, stamp_ns: u64) -> Option<(DVec3, DQuat)> {
         let after = self.stamps_ns.partition_point(|at| *at < stamp_ns);
         let before = after.checked_sub(1)?;
@@ -37,7 +37,7 @@ impl Truth {
         Some((p.lerp(next_p, share), q.slerp(next_q, share)))
     }
 
-    /// Returns when it left the floor, and when it was back. [ns]
+    /// Returns the times of take-off and landing. [ns]
     fn flight_ns(&self) -> (u64, u64) {
         let is_up = |(p, _): &(DVec3, DQuat)| p.z > STANDS_M;
         let first = self.poses.iter().position(is_up).expect("it took off");
@@ -46,7 +46,7 @@ impl Truth {
     }
 }
 
-/// Receives the truth until it is told to end.
+/// Receives true poses until `done` is set.
 fn listen(socket: &UdpSocket, done: &AtomicBool) -> Truth {
     socket.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
     let mut truth = Truth { stamps_ns: Vec::new(), poses: Vec::new() };
@@ -64,12 +64,12 @@ fn listen(socket: &UdpSocket, done: &AtomicBool) -> Truth {
     truth
 }
 
-/// How far fused poses were off, and how far they say that they may be.
+/// Errors of fused poses, and their sigmas.
 #[derive(Default)]
 struct Errors {
     off_m: Vec<f64>,
     off_rad: Vec<f64>,
-    /// Of the position, in sigmas, squared and summed over the axes.
+    /// Squared position errors in sigmas, summed over the axes.
     squares: Vec<f64>,
 }
 
@@ -85,7 +85,7 @@ impl Errors {
     fn rms_deg(&self) -> f64 {
         mean(self.off_rad.iter().map(|rad| rad * rad)).sqrt().to_degrees()
     }
-    /// 1 is honest.
+    /// Returns the mean squared error in sigmas per axis; 1 means correct sigmas.
     fn nees_per_axis(&self) -> f64 {
         mean(self.squares.iter().copied()) / 3.0
     }
@@ -96,7 +96,7 @@ fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     values.sum::<f64>() / count
 }
 
-/// Compares the poses of a flight log with the truth: of the whole flight, and of what is low.
+/// Compares the poses of a flight log with the truth: of the complete flight, and of its low part.
 fn compare(log: &Path, truth: &Truth) -> (Errors, Errors) {
     let mut poses = RecordedPoses::new(LogReader::open(log).unwrap());
     let mut entries = LogReader::new(File::open(log).unwrap()).unwrap();
@@ -107,7 +107,7 @@ fn compare(log: &Path, truth: &Truth) -> (Errors, Errors) {
         if &*message.topic != "/motion" {
             continue;
         }
-        // Each pose is followed by how it moves, and how sure it is.
+        // Each pose is followed by its velocity and its sigmas.
         let recorded = poses.next().unwrap().expect("a pose for each motion");
         assert_eq!(recorded.at_ns, message.log_time_ns);
         let motion: Value = serde_json::from_slice(&message.data).unwrap();
@@ -130,7 +130,7 @@ fn compare(log: &Path, truth: &Truth) -> (Errors, Errors) {
     (all, low)
 }
 
-/// Flies the room over the mat with errors of survey and mount by a seed, and checks how.
+/// Flies the room over the mat with seeded errors of survey and mount, and checks the accuracy.
 fn fly(seed: u32) {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name).display().to_string();
@@ -173,8 +173,8 @@ fn fly(seed: u32) {
     if !demo.has_finished(&report, code) {
         return;
     }
-    // From before it is armed until it stands on the other pad each image has a pose, however slow the machine is; silence of
-    // half a second would have ended the flight.
+    // From arming to standing on the other pad, each image must give a pose, on any machine; half a second without
+    // poses would end the flight.
     let tags = &report["localization"];
     assert_eq!(tags["located"], tags["sets"], "{tags:#}");
     for errors in [&all, &low] {
@@ -186,7 +186,7 @@ fn fly(seed: u32) {
 }
 
 #[test]
-fn the_room_is_flown_over_a_mat_alone() {
+fn flies_the_room_with_a_mat_only() {
     let seeds: u32 =
         std::env::var("VIZFLYT_SEEDS").ok().and_then(|text| text.parse().ok()).unwrap_or(1);
     for seed in 7..7 + seeds {
@@ -195,7 +195,7 @@ fn the_room_is_flown_over_a_mat_alone() {
 }
 
 #[test]
-fn what_is_larger_than_the_mat_is_refused() {
+fn rejects_a_scene_larger_than_the_mat() {
     let forest = ["demo", "--headless", "--localization=mat", "--scene=forest"];
     check_refused(&forest, &["the mat covers a hall of 11 x 4.5 m", "use --scene room or race"]);
 }

@@ -1,21 +1,21 @@
-//! What a student breaks, with real processes in real time: a plugin that hangs, one that leaks, and one that crashes
-//! and is started again. The vehicle lands, and the student reads one clear sentence. The vehicle is watched from
-//! outside, by the motion capture's own packets. How soon it holds and lands, for these and all other misdeeds, is held
-//! by `failsafe` on a virtual clock; how a process is confined and ended, by the runtime's `supervisor/tests.rs`.
+//! Plugin faults with real processes in real time: a plugin that hangs, one that leaks, and one that crashes and is
+//! restarted. The vehicle lands, and the student reads one clear message. The vehicle is observed from outside, by the
+//! motion capture's packets. Time limits for these and all other faults are tested by `failsafe` on a virtual clock;
+//! confinement and end of a process, by the runtime's `supervisor/tests.rs`.
 //!
-//! The plugin is `jetson/runtime/examples/misbehave.rs`; Python's own misdeeds are in `tests/python`.
+//! The plugin is `jetson/runtime/examples/misbehave.rs`; faults of Python plugins are in `tests/python`.
 
 use std::time::Instant;
 
 use crate::lab::{Lab, Plan, Seen};
 
-/// A misdeed, and what is to come of it.
+/// A plugin fault and the expected result.
 struct Case {
     how: &'static str,
     /// Settings of `[plugin]`.
     settings: &'static str,
     outcome: &'static str,
-    /// The sentence that the student reads.
+    /// Message for the student.
     sentence: &'static str,
 }
 
@@ -36,7 +36,7 @@ const CASES: [Case; 3] = [
     },
 ];
 
-/// Vehicles that fly at a time.
+/// Number of simultaneous flights.
 const TOGETHER: usize = 3;
 
 #[test]
@@ -58,7 +58,7 @@ fn vehicle_holds_or_lands_for_any_plugin_fault() {
 }
 
 impl Case {
-    /// Returns what was not as stated.
+    /// Returns the violated requirement, if any.
     fn complaint(&self, seen: &Seen) -> Option<String> {
         let complain = |what: String| {
             let lines: Vec<_> = seen.lines.iter().map(|(_, line)| line.to_string()).collect();
@@ -76,14 +76,14 @@ impl Case {
             "{:36} stands after {stopped_s:.2} s, lands after {landing_s:.2} s; {}: {}",
             self.how, seen.report["outcome"], seen.report["reason"]
         );
-        // On the floor, where it stood at first, and still.
+        // The vehicle must stand on the floor.
         if !(z_m < 0.3 && v_mps < 0.2) {
             return complain(format!("it ended {z_m} m high, at {v_mps} m/s"));
         }
         if seen.report["outcome"] != self.outcome {
             return complain(format!("it ended as {}", seen.report["outcome"]));
         }
-        // One sentence, not a hundred.
+        // A few messages, not a hundred.
         let count = seen.count(self.sentence);
         if !(1..=12).contains(&count) {
             return complain(format!("'{}' was reported {count} times", self.sentence));
@@ -91,7 +91,7 @@ impl Case {
         self.particular(seen).and_then(complain)
     }
 
-    /// What only one of them has.
+    /// Checks the requirements of single cases.
     fn particular(&self, seen: &Seen) -> Option<String> {
         let restarts = seen.report["plugin_restarts"].as_u64();
         if self.settings.contains("restart") && restarts != Some(2) {
@@ -101,7 +101,7 @@ impl Case {
         if !(furthest < 2.6) {
             return Some(format!("it was at x = {furthest} m, outside the fence"));
         }
-        // Lines carry the tick at which they were read.
+        // Lines must contain the tick at which they were read.
         let lines = seen.lines.iter().filter(|(_, line)| line["plugin"].is_object());
         let stamped = lines.clone().filter(|(_, line)| line["plugin"]["tick"].is_u64()).count();
         (stamped == 0 || stamped != lines.count()).then(|| "a line has no tick".to_owned())

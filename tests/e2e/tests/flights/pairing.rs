@@ -1,4 +1,4 @@
-//! Pairing at the command line, as a person does it: two folders of keys stand for two computers.
+//! Pairing at the command line: two folders of keys represent two computers.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -29,7 +29,7 @@ impl Server {
         Self { child, lines }
     }
 
-    /// Returns the next line that has `key`.
+    /// Returns the next line with `key`.
     fn line(&mut self, key: &str) -> Value {
         loop {
             let mut text = String::new();
@@ -55,7 +55,7 @@ fn text_of(output: &Output) -> String {
 }
 
 #[test]
-fn a_computer_is_refused_then_paired_then_let_in() {
+fn unpaired_computer_is_rejected_and_accepted_after_pairing() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     let (scene, server_keys, keys) = (at("scene"), at("server"), at("jetson"));
@@ -76,7 +76,7 @@ fn a_computer_is_refused_then_paired_then_let_in() {
         text_of(&output)
     };
 
-    // This side knows no such server; nor does the server know this side.
+    // First without a known server, then with a server that does not know this computer.
     let advice = format!("run `vizflyt pair {address}`");
     let text = fly(&[]);
     assert!(text.contains("not paired") && text.contains(&advice), "{text}");
@@ -96,7 +96,7 @@ fn a_computer_is_refused_then_paired_then_let_in() {
     let text = fly(&[]);
     assert!(!text.contains("paired") && text.contains("autopilot"), "{text}");
 
-    // The same identity after a restart.
+    // The identity is the same after a restart.
     drop(server);
     let mut again = Server::start(&folder.path().join("scene/arena.toml"), Path::new(&server_keys));
     let ready_again = again.line("ready");

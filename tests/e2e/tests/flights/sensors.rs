@@ -1,4 +1,4 @@
-//! Sensors beside the cameras, from the real program's flight: what the plugin was given against the true geometry of
+//! Sensors other than cameras in a flight of the real program: the plugin's readings compared with the true geometry of
 //! the forest, a change in flight, and the log.
 
 use std::fs::File;
@@ -19,7 +19,7 @@ use zerocopy::FromBytes;
 const AIRBORNE: Duration = Duration::from_secs(90);
 const FLIGHT: Duration = Duration::from_mins(4);
 const SEED: u64 = 7;
-/// Without noise, so that what is left is geometry.
+/// Sensors without noise, so that only geometric errors remain.
 const SENSORS: &str = r#"
 [[sensors]]
 name = "down"
@@ -42,7 +42,7 @@ model = "iwr6843"
 position_m = [0.1, 0.0, 0.0]
 "#;
 
-/// Returns how far it is from `from_m` along a unit vector to the first solid. [m, world]
+/// Returns the distance from `from_m` along a unit vector to the first solid. [m, world]
 fn true_range_m(truth: &[Volume], from_m: DVec3, along: DVec3) -> f64 {
     let mut range_m = 0.0;
     for _ in 0..400 {
@@ -56,7 +56,7 @@ fn true_range_m(truth: &[Volume], from_m: DVec3, along: DVec3) -> f64 {
     range_m
 }
 
-/// Returns what the share of all is below. [m]
+/// Returns a quantile. [m]
 fn quantile(errors_m: &mut [f64], share: f64) -> f64 {
     errors_m.sort_by(f64::total_cmp);
     errors_m[((errors_m.len() - 1) as f64 * share) as usize]
@@ -74,7 +74,7 @@ fn request(url: &str, line: &str, body: &str) -> String {
 }
 
 #[test]
-fn readings_agree_with_the_true_geometry_and_change_in_flight() {
+fn readings_match_the_true_geometry_and_change_in_flight() {
     let folder = tempfile::tempdir().unwrap();
     let place = folder.path().join("forest");
     let (place, flights) = (place.to_str().unwrap(), folder.path().join("flights"));
@@ -122,7 +122,7 @@ fn readings_agree_with_the_true_geometry_and_change_in_flight() {
             let world_from_body = sensor.pose_at_reading().expect("the forest gives the pose");
             let world_from_sensor = world_from_body * sensor.body_from_sensor();
             let from_m = world_from_sensor.translation_m;
-            // On the ground it is nearer than it measures.
+            // Near the ground, distances are below the sensor's minimum.
             if from_m.z < 0.5 {
                 continue;
             }
@@ -140,9 +140,9 @@ fn readings_agree_with_the_true_geometry_and_change_in_flight() {
                     let bytes = records.bytes.chunks_exact(size_of::<LidarPoint>());
                     assert!(bytes.len() > 1000, "a sweep of {} points", bytes.len());
                     let points = bytes.map(|bytes| LidarPoint::read_from_bytes(bytes).unwrap());
-                    // The sweep's last milliseconds: the pose is that of its end.
+                    // Only the last milliseconds of the sweep, because the pose is that of its end.
                     let last = points.filter(|point| point.before_ns < 8_000_000).step_by(7);
-                    // Of trunks within the fence: the truth has neither plants nor what stands beyond.
+                    // Only hits on trunks within the fence: the true geometry has neither plants nor objects beyond.
                     let on_trunks =
                         last.map(|p| DVec3::from(p.p_m.map(f64::from))).filter(|&p_m| {
                             let along = world_from_sensor.rotate(p_m).normalize();
@@ -169,11 +169,11 @@ fn readings_agree_with_the_true_geometry_and_change_in_flight() {
         "down: median {:.4}, 95 % {:.4}; top: median {:.4}, 90 % {:.4} m; {radar} of the radar",
         figures[0], figures[1], figures[2], figures[3]
     );
-    // Splats are not the solids that they are strewn over; a beam that grazes a trunk is off by what is behind it.
+    // Splats differ from the solids that they cover; a beam that grazes a trunk measures the background.
     assert!(figures[0] < 0.03 && figures[1] < 0.10, "down: {figures:?}");
     assert!(figures[2] < 0.03 && figures[3] < 0.30, "top: {figures:?}");
 
-    // As a data set: every reading once.
+    // The data set contains every reading once.
     let set = folder.path().join("set");
     let set_name = set.to_str().unwrap();
     good(&["export", log.to_str().unwrap(), "--format", "euroc", "-o", set_name]);
@@ -183,7 +183,7 @@ fn readings_agree_with_the_true_geometry_and_change_in_flight() {
     let place = std::fs::read_to_string(set.join("mav0/nose/sensor.yaml")).unwrap();
     assert!(place.contains("sensor_type: radar") && place.contains("T_BS"), "{place}");
 
-    // The plugin is replayed with the very readings that it had.
+    // The replay gives the plugin the same readings.
     let report = folder.path().join("report.json");
     let arguments = ["replay", log.to_str().unwrap(), "--report", report.to_str().unwrap()];
     let done = run(&arguments);

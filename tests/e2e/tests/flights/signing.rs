@@ -1,5 +1,5 @@
-//! A flight whose every MAVLink packet is signed: the key is given over the wire, as a person would give
-//! it; from then on the vehicle obeys its runtime and nobody else.
+//! A flight with signed MAVLink packets: the signing key is sent over the wire, as a person would do it. From then on
+//! the vehicle obeys only its runtime.
 
 use std::process::Command;
 
@@ -8,8 +8,8 @@ use vizflyt_e2e::vizflyt;
 use vizflyt_protocol::mavlink::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, encode};
 
-/// Motors off, armed or not: what a stranger would do. MAV_CMD_COMPONENT_ARM_DISARM with ArduPilot's
-/// number that forces it.
+/// Returns a packet that stops the motors even in flight, as an attacker would send it: MAV_CMD_COMPONENT_ARM_DISARM
+/// with ArduPilot's number that forces it.
 fn motors_off() -> Vec<u8> {
     let message = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
         command: MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
@@ -24,11 +24,11 @@ fn motors_off() -> Vec<u8> {
 }
 
 #[test]
-fn a_signed_flight_is_flown_and_a_stranger_is_not_obeyed() {
+fn signed_flight_ignores_unsigned_commands() {
     let folder = tempfile::tempdir().unwrap();
     let key = folder.path().join("mavlink.key");
     let key = key.to_str().unwrap();
-    // Made for another vehicle, which needs not be there any more.
+    // A key made for another vehicle.
     let digits = "1f".repeat(32);
     std::fs::write(key, digits).unwrap();
     let mode = std::os::unix::fs::PermissionsExt::from_mode(0o600);
@@ -64,7 +64,7 @@ fn a_signed_flight_is_flown_and_a_stranger_is_not_obeyed() {
     }
     flight.until("\"phase\":\"landed\"");
     let fell = flight.so_far().0.windows(20).any(|w| w[0].p_m.z - w[19].p_m.z > 0.2);
-    assert!(!fell, "somebody cut the motors");
+    assert!(!fell, "the motors were stopped");
     let report = flight.vehicle_report();
     assert!(report["mavlink_packets_refused"].as_u64().unwrap() > 5, "{report:#}");
 }

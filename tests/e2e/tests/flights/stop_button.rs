@@ -1,5 +1,5 @@
-//! The stop button while somebody does what they can to take it away: the real server, attacked over
-//! loopback from an address of its own (127.0.0.2). What is measured is printed; a loaded machine is given seconds.
+//! The stop button under attack: a real server, attacked over loopback from a separate address (127.0.0.2). The tests
+//! print their measurements; limits of seconds allow for a loaded machine.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -25,7 +25,7 @@ struct Server {
 }
 
 impl Server {
-    /// Starts it with as many descriptors as `limits` says to a shell's `ulimit`.
+    /// Starts a server; `limits` are the arguments of the shell's `ulimit`, for the number of descriptors.
     fn start(limits: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
@@ -61,13 +61,12 @@ impl Server {
             let link = key["link"].as_str().unwrap();
             format!("vizflyt_key={}", link.split_once("key=").unwrap().1)
         });
-        // Whatever else it prints has a reader.
+        // Read all further output, so that the pipe does not fill.
         std::thread::spawn(move || lines.for_each(drop));
         Self { child, _lifeline: lifeline, http, instructor, ants, _folder: folder }
     }
 
-    /// Presses the instructor's button, from this computer, on a fresh connection; returns how long the
-    /// answer took.
+    /// Presses the instructor's button from this computer, on a new connection; returns the time of the response.
     fn stop(&self) -> Duration {
         let start = Instant::now();
         let mut stream = TcpStream::connect(self.http).expect("the server listens");
@@ -81,12 +80,12 @@ impl Server {
         .unwrap();
         let mut answer = String::new();
         stream.read_to_string(&mut answer).expect("an answer");
-        // No runtime is there to be stopped, which is an answer to an instructor alone.
+        // There is no runtime to stop; only an instructor gets this status.
         assert!(answer.starts_with("HTTP/1.1 409"), "{answer:?}");
         start.elapsed()
     }
 
-    /// Presses it many times, and prints how long it took.
+    /// Presses the button many times, and prints the times.
     fn check_stop(&self, during: &str) {
         let mut took: Vec<_> = (0..PRESSES)
             .map(|_| {
@@ -114,14 +113,14 @@ impl Drop for Server {
     }
 }
 
-/// Connects from the attacker's address, which is not that of the instructor.
+/// Connects from the attacker's address, which differs from the instructor's.
 async fn attack(to: SocketAddr) -> std::io::Result<AsyncStream> {
     let socket = TcpSocket::new_v4()?;
     socket.bind("127.0.0.2:0".parse().unwrap())?;
     socket.connect(to).await
 }
 
-/// Opens connections that say nothing, as many as this process may; returns those that stand.
+/// Opens idle connections, up to the limit of this process; returns the established ones.
 fn idle_connections(runtime: &Runtime, to: SocketAddr, most: usize) -> Vec<AsyncStream> {
     runtime.block_on(async {
         let mut streams = Vec::new();
@@ -142,14 +141,14 @@ fn idle_connections(runtime: &Runtime, to: SocketAddr, most: usize) -> Vec<Async
     })
 }
 
-/// Sees that a WebSocket still has something to say.
+/// Asserts that a WebSocket still sends messages.
 fn check_lives(socket: &mut WebSocket) {
     for _ in 0..40 {
         assert!(socket.receive().0 <= 2, "it was closed");
     }
 }
 
-/// Returns why a WebSocket is closed.
+/// Returns the close reason of a WebSocket.
 fn reason(socket: &mut WebSocket) -> String {
     loop {
         let (opcode, payload) = socket.receive();
@@ -160,16 +159,16 @@ fn reason(socket: &mut WebSocket) -> String {
 }
 
 #[test]
-fn it_answers_whatever_one_address_and_one_team_do() {
-    // As many as there are, less what the test itself needs.
+fn stop_button_works_under_attack_of_one_address_and_one_team() {
+    // Use all available descriptors, except those that the test itself needs.
     let (_, hard) = getrlimit(Resource::RLIMIT_NOFILE).unwrap();
     setrlimit(Resource::RLIMIT_NOFILE, hard, hard).unwrap();
     let most = usize::try_from(hard).unwrap_or(usize::MAX).saturating_sub(500).min(10_000);
-    // What a login shell has: the server raises it by itself.
+    // The soft limit of a login shell; the server raises it itself.
     let server = Server::start("-S -n 1024");
     let runtime = Runtime::new().unwrap();
     let mut watching = server.watch("/ws?vehicle=ant", &server.instructor);
-    server.check_stop("nobody attacks");
+    server.check_stop("no attack");
 
     let idle = idle_connections(&runtime, server.http, most);
     assert!(idle.len() >= most.min(1100), "only {} connections", idle.len());
@@ -190,7 +189,7 @@ fn it_answers_whatever_one_address_and_one_team_do() {
     go_on.abort();
     drop(idle);
 
-    // With a team's key: its own pages have their places, the others are told why they have none.
+    // With a team's key: its first pages stay connected, further ones are closed with a reason.
     let mut team: Vec<_> = (0..64).map(|_| server.watch("/ws?vehicle=ant", &server.ants)).collect();
     server.check_stop("64 WebSockets of a team");
     let told = reason(team.last_mut().unwrap());
@@ -200,7 +199,7 @@ fn it_answers_whatever_one_address_and_one_team_do() {
     assert_eq!(late.receive().0, TEXT);
     check_lives(&mut late);
 
-    // Bodies that never end, a hundred a second.
+    // Bodies that never end, 100 per second.
     let posts = runtime.spawn({
         let http = server.http;
         async move {
@@ -220,14 +219,14 @@ fn it_answers_whatever_one_address_and_one_team_do() {
         }
     });
     std::thread::sleep(Duration::from_secs(2));
-    server.check_stop("100 slow posts a second");
+    server.check_stop("100 slow posts per second");
     posts.abort();
     check_lives(&mut watching);
 }
 
-/// The whole process has 64 descriptors, and more connections come than that.
+/// The process has 64 descriptors, and more connections arrive.
 #[test]
-fn it_answers_where_descriptors_are_few() {
+fn stop_button_works_with_few_descriptors() {
     let server = Server::start("-n 64");
     let runtime = Runtime::new().unwrap();
     let idle = idle_connections(&runtime, server.http, 400);
@@ -235,7 +234,7 @@ fn it_answers_where_descriptors_are_few() {
     server.check_stop("400 idle connections, 64 descriptors");
 }
 
-/// Far beyond what a loaded machine needs; a server without places does not answer at all.
+/// Timeout, far above what a loaded machine needs; a server without free connections would not respond at all.
 const PATIENCE: Duration = Duration::from_secs(10);
 const PRESSES: usize = 20;
 /// Opcode of a close frame (RFC 6455, section 5.2).

@@ -1,5 +1,4 @@
-//! A lab with AprilTags is set up by its commands, from the printer to surveyed cameras, on images whose
-//! truth is known.
+//! Sets up a lab with AprilTags by its commands, from printing to surveyed cameras, on images with known truth.
 
 use std::path::Path;
 use std::process::{Command, Output};
@@ -51,7 +50,7 @@ fn webcam() -> Intrinsics {
     }
 }
 
-/// Numbers that repeat, from -1 to 1.
+/// Returns reproducible numbers from -1 to 1.
 fn wobble(i: u32, rate: f64) -> f64 {
     (f64::from(i) * rate).sin()
 }
@@ -79,7 +78,7 @@ fn write_folder(folder: &Path, images: &[Gray]) {
     }
 }
 
-/// The board all over the image, tilted to all sides.
+/// Returns images with the board in all parts of the image, tilted in all directions.
 fn calibration_images(board: &TagLayout, lens: &Renderer) -> Vec<Gray> {
     (0..40)
         .map(|i| {
@@ -101,7 +100,7 @@ fn towards(from_m: DVec3, to_m: DVec3) -> Pose<World, Cam> {
 }
 
 #[test]
-fn a_lab_is_set_up_from_the_printer_to_surveyed_cameras() {
+fn sets_up_a_lab_from_printing_to_surveyed_cameras() {
     let home = tempfile::tempdir().unwrap();
     let home = home.path();
     let lens = Renderer::new(webcam());
@@ -133,7 +132,7 @@ fn a_lab_is_set_up_from_the_printer_to_surveyed_cameras() {
     assert!(left.calibration.unwrap().held_out_rms_px < 0.3, "{left:?}");
     assert_eq!(left.name, "left");
 
-    // Survey the mat, glued a little askew, from a stream of images.
+    // Survey the mat, glued slightly inaccurately, from a stream of images.
     let mut glued = TagLayout::read(&home.join("mat.toml")).unwrap();
     for (i, tag) in (0..).zip(&mut glued.tags).skip(1) {
         tag.position_m += DVec3::new(wobble(i, 3.1), wobble(i, 5.3), 0.0) * 0.004;
@@ -160,7 +159,7 @@ fn a_lab_is_set_up_from_the_printer_to_surveyed_cameras() {
         assert!(off_m < 0.002, "tag {} is {:.1} mm off: {printed}", tag.id, 1e3 * off_m);
     }
 
-    // Survey two fixed cameras by that mat.
+    // Survey two fixed cameras with that mat.
     let right = TagCamera { name: "right".into(), ..left };
     right.write(&home.join("right.toml")).unwrap();
     let truth = [DVec3::new(-0.5, -0.3, 0.6), DVec3::new(0.45, 0.35, 0.7)]
@@ -181,7 +180,7 @@ fn a_lab_is_set_up_from_the_printer_to_surveyed_cameras() {
         let off_rad = found.rotation.angle_between(truth.rotation);
         assert!(off_m < 0.01 && off_rad < 0.01, "{name}: {off_m} m, {off_rad} rad: {printed}");
     }
-    // A cube's layout is no mat.
+    // A cube's layout is not a mat.
     let wrong = ["survey", "cameras", files[0], "--mat", "cube.toml"];
     refused(home, &wrong, &["cube.toml", "on the vehicle", "print mat"]);
 }

@@ -1,4 +1,4 @@
-//! The two tables that are measured on a virtual clock: what each loss of a link costs, and what a bad network does.
+//! Tables measured on a virtual clock: failsafe reactions to losses, and effects of network faults.
 
 mod failsafe;
 mod faults;

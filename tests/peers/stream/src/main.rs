@@ -1,6 +1,6 @@
-//! How long bytes of an image's size take over loopback by other transports, to the receiver's
-//! callback: zenoh (two sessions, TCP between them) and raw TCP, one after the other in one
-//! process. `vizflyt bench stream` prints ours beside the same raw TCP, so the ratios compare.
+//! Latency of image-sized messages over loopback with other transports, until the receiver's callback: zenoh (two
+//! sessions, TCP between them) and raw TCP, one after the other in one process. `vizflyt bench stream` prints our
+//! latency next to the same raw TCP, so the ratios can be compared.
 //!
 //! Usage: vizflyt-stream-peers [SECONDS [BYTES [HZ]]]     default 10 120000 60
 
@@ -26,7 +26,7 @@ fn main() -> Result<()> {
         period: Duration::from_secs_f64(1.0 / hz.max(1) as f64),
         count: seconds * hz,
     };
-    println!("{bytes} bytes at {hz} Hz over loopback, handed over -> received whole");
+    println!("{bytes} bytes at {hz} Hz over loopback, sent -> received completely");
     let tcp = bench.tcp()?;
     let zenoh = bench.zenoh()?;
     println!("zenoh takes {:.2} times as long as tcp", zenoh / tcp);
@@ -45,7 +45,7 @@ impl Bench {
         self.start.elapsed().as_nanos() as u64
     }
 
-    /// Calls `send` with the payload when it is due, its first bytes the time.
+    /// Calls `send` at each due time with the payload, which starts with the time.
     fn tick(&self, mut send: impl FnMut(&[u8]) -> Result<()>) -> Result<()> {
         let mut payload = self.payload.clone();
         let mut due = Instant::now();
@@ -59,13 +59,13 @@ impl Bench {
         Ok(())
     }
 
-    /// Prints the percentiles; returns the median. [ms]
+    /// Prints percentiles; returns the median. [ms]
     fn print(&self, name: &str, mut ms: Vec<f64>) -> Result<f64> {
         ms.sort_unstable_by(f64::total_cmp);
         let last = ms.len().checked_sub(1).ok_or("nothing arrived")?;
         let at = |share: f64| ms[(share * last as f64).round() as usize];
         println!(
-            "{name:<7} p50 {:.2} ms, p99 {:.2}, max {:.2}; {} of {} came",
+            "{name:<7} p50 {:.2} ms, p99 {:.2}, max {:.2}; {} of {} received",
             at(0.5),
             at(0.99),
             at(1.0),
@@ -83,7 +83,7 @@ impl Bench {
         let (start, len) = (self.start, self.payload.len());
         let receiving = thread::spawn(move || {
             let (mut ms, mut image) = (Vec::new(), vec![0; len]);
-            // The end of the connection is the end.
+            // Read until the connection closes.
             while receive.read_exact(&mut image).is_ok() {
                 ms.push(age_ms(start, &image));
             }
@@ -112,7 +112,7 @@ impl Bench {
         let _subscriber = listening
             .declare_subscriber("image")
             .callback(move |sample| {
-                // As an application sees it: all of the image in one piece.
+                // The complete image in one piece, as an application needs it.
                 let bytes = sample.payload().to_bytes();
                 let _ = sender.send(age_ms(start, &bytes));
             })
@@ -123,7 +123,7 @@ impl Bench {
             .priority(Priority::RealTime)
             .express(true)
             .wait()?;
-        // Until the subscription has reached the publisher.
+        // Wait until the subscription has reached the publisher.
         thread::sleep(Duration::from_millis(500));
         self.tick(|payload| publisher.put(payload).wait())?;
         self.print("zenoh", received.try_iter().collect())

@@ -1,11 +1,12 @@
-//! Blocks against pixels, one by one.
+//! Compares covered blocks with the pixels that they contain.
 
 use proptest::prelude::*;
 
 use super::*;
 use crate::cpu::simd::{InstructionSet, Kernel};
 
-/// A projected splat as `project` writes it: of a mean, a covariance `[a b; b c]` [px^2] and log2 of an opacity.
+/// Returns a projected splat in the form of `project`, from its mean, covariance `[a b; b c]` [px^2] and the binary
+/// logarithm of its opacity.
 fn splat([mean_x, mean_y]: [f32; 2], [a, b, c]: [f32; 3], level: f32) -> Splat2d {
     let half = std::f32::consts::LOG2_E / 2.0;
     let reach = (level - MIN_LEVEL) * 2.0 * std::f32::consts::LN_2;
@@ -24,14 +25,14 @@ fn splat([mean_x, mean_y]: [f32; 2], [a, b, c]: [f32; 3], level: f32) -> Splat2d
     }
 }
 
-/// By how much the splat's level at a pixel's centre is above what is seen.
+/// Returns the splat's level at a pixel's centre above the minimum visible level.
 fn above(splat: &Splat2d, [x, y]: [usize; 2]) -> f32 {
     let (dx, dy) = (x as f32 + 0.5 - splat.mean_x, y as f32 + 0.5 - splat.mean_y);
     let (u, v) = ((dx - splat.shear * dy) * splat.scale_x, dy * splat.scale_y);
     splat.level - u * u - v * v - MIN_LEVEL
 }
 
-/// Blocks of 4x4 tiles, as [`Bands`] finds them: by row of tiles, then tile.
+/// Finds the blocks of 4x4 tiles with [`Bands`]: by row of tiles, then tile.
 struct Large<'a>(&'a Splat2d);
 
 impl Kernel for Large<'_> {
@@ -54,7 +55,7 @@ impl Kernel for Large<'_> {
     }
 }
 
-/// The same by [`window`] and [`Cover::split`], of a window that starts with a block.
+/// Finds the same blocks with [`window`] and [`Cover::split`], for a window that starts at a given block.
 struct Small<'a>(&'a Splat2d, [usize; 2]);
 
 impl Kernel for Small<'_> {
@@ -91,8 +92,8 @@ impl Kernel for Small<'_> {
     }
 }
 
-/// Every pixel of 64x64 that is seen lies in a block that is listed, and no block is listed without need: within a pixel
-/// there is one that is seen, or nearly.
+/// Checks 64x64 pixels: every visible pixel is in a listed block, and every listed block is needed, that is within a
+/// pixel of it a point is visible or nearly visible.
 fn check(
     splat: &Splat2d,
     lanes: usize,
@@ -114,7 +115,7 @@ fn check(
             for block in (0..COLUMNS * bands).filter(|block| blocks >> block & 1 == 1) {
                 let x = column * TILE + block / bands * BLOCK_WIDTH;
                 let y = row * TILE + block % bands * height;
-                // On a grid of eighths of a pixel between the block's centres, ends included.
+                // On a grid of eighths of a pixel between the block's pixel centres, ends included.
                 let best = (0..=8 * (height - 1))
                     .flat_map(|j| (0..=8 * (BLOCK_WIDTH - 1)).map(move |i| (i, j)))
                     .map(|(i, j)| {
@@ -134,7 +135,7 @@ fn check(
 
 proptest! {
     #[test]
-    fn every_pixel_that_is_seen_has_its_block(
+    fn every_visible_pixel_is_in_a_listed_block(
         x in -10.0..74.0f32, y in -10.0..74.0f32,
         a in 0.3..400.0f32, c in 0.3..400.0f32, turn in -0.99..0.99f32, level in -7.9..-0.01f32,
     ) {
@@ -146,7 +147,7 @@ proptest! {
     }
 
     #[test]
-    fn a_window_is_shifted_to_where_its_tiles_lie(
+    fn split_moves_a_window_to_its_tiles(
         left in 0usize..16, top in 0usize..32, x in 0.0..16.0f32, y in 0.0..16.0f32,
         a in 0.3..6.0f32, c in 0.3..6.0f32, turn in -0.99..0.99f32, level in -7.9..-0.01f32,
     ) {

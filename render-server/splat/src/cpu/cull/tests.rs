@@ -8,7 +8,7 @@ use crate::cpu::lens::Lenses;
 use crate::cpu::project::{Projected, project};
 use crate::cpu::simd::Portable;
 
-/// Splats all around, most of them small, some of them metres across; some 120 blocks.
+/// Returns splats in all directions, mostly small, some of them metres across; about 120 blocks.
 fn part() -> Part {
     let mut splats = Splats::default();
     for i in 0..30_000u32 {
@@ -41,7 +41,7 @@ fn lenses() -> Vec<Intrinsics> {
             }
             for [k1, k2, k3, k4] in [[0.0; 4], [0.1, -0.02, 0.005, -0.001], [-0.2, 0.0, 0.0, 0.0]] {
                 let distortion = Distortion::KannalaBrandt { k1, k2, k3, k4 };
-                // As many pixels per radian as fit.
+                // Maximum pixels per radian at which the field of view fits the image.
                 let f_px = 96.0 / fov;
                 all.push(Intrinsics { distortion, fx_px: f_px, fy_px: f_px, ..k });
             }
@@ -51,7 +51,7 @@ fn lenses() -> Vec<Intrinsics> {
 }
 
 #[test]
-fn no_block_is_culled_that_holds_a_splat_in_view() {
+fn does_not_cull_blocks_with_visible_splats() {
     let part = part();
     let everything: Vec<Visible> =
         (0..part.blocks.len()).map(|block| Visible { part: 0, block: block as u32 }).collect();
@@ -79,8 +79,8 @@ fn no_block_is_culled_that_holds_a_splat_in_view() {
             }
             seen_share += visible.len() as f64 / part.blocks.len() as f64 / 12.0;
         }
-        // A lens that sees 23 degrees sees little, but blocks here are metres across, and those
-        // beside the camera count as large.
+        // A lens of 23 degrees sees little, but blocks here are metres across, and those next to the camera count as
+        // large.
         let most = if intrinsics.distortion == Distortion::None { 0.3 } else { 0.7 };
         assert!(intrinsics.fx_px < 200.0 || seen_share < most, "{intrinsics:?} sees {seen_share}");
     }

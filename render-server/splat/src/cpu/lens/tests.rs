@@ -19,7 +19,7 @@ fn every_set<K: Kernel + Clone>(kernel: &K) {
     }
 }
 
-/// The arc tangent over all that slopes may be.
+/// Checks the arc tangent over all possible slopes.
 #[derive(Clone)]
 struct Atan;
 
@@ -41,7 +41,7 @@ impl Kernel for Atan {
     }
 }
 
-/// A lens on vectors against the protocol's own; slopes up to `longest`.
+/// Compares a lens on vectors with the protocol's implementation; slopes up to the second field.
 #[derive(Clone)]
 struct Distort(Distortion, f64);
 
@@ -89,12 +89,12 @@ impl Kernel for Distort {
 }
 
 #[test]
-fn the_arc_tangent_is_exact_to_a_thousandth_of_a_pixel() {
+fn arc_tangent_is_exact_to_a_thousandth_of_a_pixel() {
     every_set(&Atan);
 }
 
 #[test]
-fn lenses_bend_vectors_as_the_protocol_has_it() {
+fn vector_distortion_matches_the_protocol() {
     every_set(&Distort(Distortion::None, 50.0));
     let (k1, k2, k3) = (-0.21, 0.06, -0.004);
     every_set(&Distort(Distortion::BrownConrady { k1, k2, p1: 0.003, p2: -0.002, k3 }, 1.2));
@@ -103,7 +103,7 @@ fn lenses_bend_vectors_as_the_protocol_has_it() {
 }
 
 #[test]
-fn lenses_are_found_again_and_the_oldest_is_forgotten() {
+fn lens_cache_replaces_the_oldest() {
     let camera = |i: u32| {
         Camera::new(Intrinsics::from_horizontal_fov(64 + i, 48, 1.2), Pose::IDENTITY, 0.05)
     };

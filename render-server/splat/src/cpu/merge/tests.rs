@@ -6,7 +6,7 @@ use super::*;
 fn blob() -> impl Strategy<Value = Blob> {
     (
         prop::array::uniform3(-50.0..50.0f64),
-        // Log scales: 10 um to 7 m, so flat and thin ones too.
+        // Logarithms of the scales: 10 um to 7 m, which includes flat and thin splats.
         prop::array::uniform3(-11.0..2.0f64),
         prop::array::uniform4(-1.0..1.0f64),
         0.004..=1.0f64,
@@ -25,7 +25,7 @@ fn close(a: &DMat3, b: &DMat3) -> bool {
     a.to_cols_array().iter().zip(b.to_cols_array()).all(|(a, b)| (a - b).abs() <= 1e-6 * size)
 }
 
-/// Mean and second moment about a point of the mixture, by the definition.
+/// Computes mean and second moment about a point of the mixture from the definition.
 fn moments(blobs: &[Blob], about: DVec3, blur_m2: f64) -> (DVec3, DMat3) {
     let total: f64 = blobs.iter().map(|blob| blob.mass(blur_m2)).sum();
     let mut mean = DVec3::ZERO;
@@ -48,15 +48,15 @@ proptest! {
         let (mean, covariance) = moments(&blobs, merged.mean_m, blur_m2);
         prop_assert!(merged.mean_m.distance(mean) < 1e-9 * 100.0);
         prop_assert!(close(&merged.covariance_m2, &covariance));
-        // What they cover adds up, and so do they.
+        // Covered areas add up, and so do counts.
         let mass: f64 = blobs.iter().map(|blob| blob.mass(blur_m2)).sum();
         prop_assert!((merged.mass(blur_m2) / mass - 1.0).abs() < 1e-5);
         prop_assert_eq!(merged.origin.count, blobs.len() as f32);
     }
 
-    /// Level upon level is as all at once.
+    /// Merging level by level gives the same result as merging all at once.
     #[test]
-    fn merging_in_two_steps_is_merging_in_one(
+    fn merging_in_two_steps_equals_merging_in_one(
         blobs in prop::collection::vec(blob(), 4..12), blur_m2 in 0.0..0.1f64,
     ) {
         let once = merge(blobs.iter().copied(), blur_m2);
@@ -71,7 +71,7 @@ proptest! {
     }
 
     #[test]
-    fn one_splat_stays_as_it_is(blob in blob(), blur_m2 in 0.0..0.1f64) {
+    fn one_splat_is_unchanged(blob in blob(), blur_m2 in 0.0..0.1f64) {
         let merged = merge([blob].into_iter(), blur_m2);
         let (covariance, opacity) = merged.rendered(blur_m2);
         prop_assert!(close(&covariance, &blob.covariance_m2));
@@ -80,7 +80,7 @@ proptest! {
     }
 
     #[test]
-    fn merged_splats_are_at_most_opaque_and_cover_no_more_area_than_their_parts(
+    fn merged_splats_are_at_most_opaque_and_cover_no_more_than_their_parts(
         blobs in prop::collection::vec(blob(), 2..40), blur_m2 in 1e-6..0.1f64,
     ) {
         let merged = merge(blobs.iter().copied(), blur_m2);
@@ -93,25 +93,25 @@ proptest! {
     }
 
     #[test]
-    fn a_square_root_times_its_transpose_is_the_covariance(blob in blob()) {
+    fn square_root_times_its_transpose_is_the_covariance(blob in blob()) {
         let root = square_root(&blob.covariance_m2);
         prop_assert!(close(&(root * root.transpose()), &blob.covariance_m2));
     }
 }
 
 #[test]
-fn area_is_that_of_the_shadow() {
+fn area_is_the_mean_projected_area() {
     let of = |x: f64, y: f64, z: f64| area(&DMat3::from_diagonal(DVec3::new(x, y, z)));
     assert!((of(4.0, 4.0, 4.0) - 4.0).abs() < 1e-12);
-    // A disc: its own area from the front, none from the side.
+    // A disc: its own area from the front, 0 from the side.
     assert!((of(9.0, 9.0, 0.0) - 9.0 / 3f64.sqrt()).abs() < 1e-12);
     assert_eq!(of(5.0, 0.0, 0.0), 0.0);
     assert_eq!(of(0.0, 0.0, 0.0), 0.0);
 }
 
 #[test]
-fn two_far_apart_cover_no_more_than_two() {
-    // 22 m apart, each some tenths of a millimetre, seen from where a pixel is 30 cm.
+fn two_distant_splats_cover_no_more_than_two() {
+    // 22 m apart, with deviations of 1.7 cm, seen at a distance at which a pixel is 30 cm.
     let points =
         [0.0, 22.0].map(|z| Blob::new(DVec3::new(0.0, 0.0, z), DMat3::IDENTITY * 3e-4, 0.7));
     let merged = merge(points.into_iter(), 0.09);
@@ -121,7 +121,7 @@ fn two_far_apart_cover_no_more_than_two() {
 }
 
 #[test]
-fn a_thickness_gives_the_area_asked_for() {
+fn thickness_gives_the_requested_area() {
     for diagonal in [[1.0, 1.0, 1.0], [100.0, 1e-9, 1e-9], [4.0, 9.0, 0.0]] {
         let covariance = DMat3::from_diagonal(diagonal.into());
         for wanted in [5.0, 70.0] {
@@ -133,18 +133,18 @@ fn a_thickness_gives_the_area_asked_for() {
 }
 
 #[test]
-fn splats_on_each_other_cover_less_than_their_sum() {
+fn overlapping_splats_cover_less_than_their_sum() {
     assert!((covered(0.7, 1.0) - 0.7).abs() < 1e-12);
-    // Two of opacity 1/2 on each other: 1/2 + (1 - 1/4) / 2 of a Gaussian.
+    // Two of opacity 1/2 at the same place: 1/2 + (1 - 1/4) / 2 of a Gaussian.
     assert!((covered(1.0, 2.0) - 0.875).abs() < 1e-12);
-    // Next to nothing adds up; many approach the exponential integral Ein(2) = 1.3193.
+    // Very small opacities add up; many splats approach the exponential integral Ein(2) = 1.3193.
     assert!((covered(1e-6, 9.0) / 1e-6 - 1.0).abs() < 1e-5);
     assert!((covered(2.0, 1e9) - 1.3193).abs() < 0.02);
     assert_eq!(covered(0.0, 5.0), 0.0);
 }
 
 #[test]
-fn a_flat_covariance_has_a_root() {
+fn flat_covariance_has_a_square_root() {
     for diagonal in
         [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0], [0.0; 3], [1e12, 1e-12, 0.0]]
     {

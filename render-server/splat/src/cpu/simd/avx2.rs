@@ -28,11 +28,11 @@ impl Avx2 {
 
 const LANES: usize = 8;
 
-/// Made only by methods of [`Avx2`], so it too is proof.
+/// Vector of 8 lanes. Created only by methods of [`Avx2`], so it also proves support.
 #[derive(Clone, Copy)]
 pub struct F32x8(__m256);
 
-/// All bits of a lane set or none; made only by methods of [`Avx2`].
+/// Mask: all bits of a lane are set or none. Created only by methods of [`Avx2`].
 #[derive(Clone, Copy)]
 pub struct Mask8(__m256);
 
@@ -42,7 +42,7 @@ macro_rules! operators {
             type Output = Self;
             #[inline(always)]
             fn $method(self, other: Self) -> Self {
-                // SAFETY: a vector exists only where AVX2 was detected.
+                // SAFETY: a vector exists only if AVX2 was detected.
                 Self(unsafe { $intrinsic(self.0, other.0) })
             }
         }
@@ -59,15 +59,15 @@ impl BitAnd for Mask8 {
     type Output = Self;
     #[inline(always)]
     fn bitand(self, other: Self) -> Self {
-        // SAFETY: a mask exists only where AVX2 was detected.
+        // SAFETY: a mask exists only if AVX2 was detected.
         Self(unsafe { _mm256_and_ps(self.0, other.0) })
     }
 }
 
-/// Calls an intrinsic that needs no more than what `self` proves.
+/// Calls an intrinsic that needs only the features that `self` proves.
 macro_rules! proven {
     ($call:expr) => {
-        // SAFETY: `self` exists only where AVX2, FMA and F16C were detected; no memory is touched.
+        // SAFETY: `self` exists only if AVX2, FMA and F16C were detected; no memory is touched.
         unsafe { $call }
     };
 }
@@ -84,7 +84,7 @@ impl Simd for Avx2 {
         fn with_avx2<K: Kernel>(kernel: K, simd: Avx2) -> K::Output {
             kernel.run(simd)
         }
-        // SAFETY: `self` is proof of every feature named.
+        // SAFETY: `self` proves every feature that is named.
         unsafe { with_avx2(kernel, self) }
     }
 
@@ -96,15 +96,14 @@ impl Simd for Avx2 {
     #[inline(always)]
     fn load(self, values: &[f32]) -> F32x8 {
         let values = &values[..LANES];
-        // SAFETY: eight floats are there; the load needs no alignment. AVX is proven by `self`.
+        // SAFETY: the slice has eight floats; the load needs no alignment. `self` proves AVX.
         F32x8(unsafe { _mm256_loadu_ps(values.as_ptr()) })
     }
 
     #[inline(always)]
     fn load_f16(self, values: &[u16]) -> F32x8 {
         let values = &values[..LANES];
-        // SAFETY: eight 16-bit numbers are there; the load needs no alignment. F16C is proven by
-        // `self`.
+        // SAFETY: the slice has eight 16-bit numbers; the load needs no alignment. `self` proves F16C.
         F32x8(unsafe { _mm256_cvtph_ps(_mm_loadu_si128(values.as_ptr().cast())) })
     }
 
@@ -147,7 +146,7 @@ impl Simd for Avx2 {
 
     #[inline(always)]
     fn exp2(self, a: F32x8) -> F32x8 {
-        /// 1.5 * 2^23: adding it rounds to a whole number, held in the low bits.
+        /// 1.5 * 2^23: adding it rounds to a whole number, which is in the low bits.
         const ROUND: f32 = 12_582_912.0;
         let rounded = a + self.splat(ROUND);
         let f = a - (rounded - self.splat(ROUND));
@@ -202,11 +201,11 @@ impl Simd for Avx2 {
     #[inline(always)]
     fn bit_planes(self, bytes: &[u8; 64]) -> [u64; 8] {
         let at = bytes.as_ptr();
-        // SAFETY: 64 bytes are there; the loads need no alignment. AVX is proven by `self`.
+        // SAFETY: the array has 64 bytes; the loads need no alignment. `self` proves AVX.
         let mut halves =
             unsafe { [_mm256_loadu_si256(at.cast()), _mm256_loadu_si256(at.add(32).cast())] };
         let mut planes = [0; 8];
-        // From the uppermost bit, which is what is gathered, down; adding a byte to itself brings up the next.
+        // The instruction collects the uppermost bits; adding a byte to itself moves the next bit up.
         for plane in planes.iter_mut().rev() {
             let [low, high] = halves.map(|half| proven!(_mm256_movemask_epi8(half)) as u32);
             *plane = u64::from(high) << 32 | u64::from(low);
@@ -217,7 +216,7 @@ impl Simd for Avx2 {
 
     #[inline(always)]
     fn prefetch<T>(self, value: &T) {
-        // SAFETY: a prefetch is a hint without effect on memory; the address is a live reference's.
+        // SAFETY: a prefetch is a hint without effect on memory, and the address is that of a live reference.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()) }
     }
 }

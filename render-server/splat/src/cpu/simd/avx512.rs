@@ -1,4 +1,4 @@
-//! AVX-512: sixteen lanes and real mask registers.
+//! AVX-512: 16 lanes and mask registers.
 
 #![allow(unsafe_code, reason = "SIMD intrinsics, after detection of the instruction set")]
 
@@ -8,7 +8,7 @@ use std::ops::{Add, BitAnd, Div, Mul, Sub};
 
 use super::{Kernel, Simd};
 
-/// Proof that the processor has AVX-512 F, VL, BW and DQ, and all that [`super::Avx2`] proves.
+/// Proof that the processor has AVX-512 F, VL, BW and DQ, and all features of [`super::Avx2`].
 #[derive(Clone, Copy, Debug)]
 pub struct Avx512(());
 
@@ -25,10 +25,10 @@ impl Avx512 {
 
 const LANES: usize = 16;
 
-/// As [`super::EXP2`], on [0, 1], since here rounding down is free: 2.7e-6.
+/// Coefficients as in [`super::EXP2`], but on [0, 1], because rounding down is free here: 2.7e-6.
 const EXP2: [f32; 5] = [1.000_002_6, 0.693_003_83, 0.241_442_74, 0.052_011_49, 0.013_534_154];
 
-/// Made only by methods of [`Avx512`], so it too is proof.
+/// Vector of 16 lanes. Created only by methods of [`Avx512`], so it also proves support.
 #[derive(Clone, Copy)]
 pub struct F32x16(__m512);
 
@@ -42,7 +42,7 @@ macro_rules! operators {
             type Output = Self;
             #[inline(always)]
             fn $method(self, other: Self) -> Self {
-                // SAFETY: a vector exists only where AVX-512 was detected.
+                // SAFETY: a vector exists only if AVX-512 was detected.
                 Self(unsafe { $intrinsic(self.0, other.0) })
             }
         }
@@ -63,11 +63,10 @@ impl BitAnd for Mask16 {
     }
 }
 
-/// Calls an intrinsic that needs no more than what `self` proves.
+/// Calls an intrinsic that needs only the features that `self` proves.
 macro_rules! proven {
     ($call:expr) => {
-        // SAFETY: `self` exists only where AVX-512 F, VL, BW, DQ were detected; no memory is
-        // touched.
+        // SAFETY: `self` exists only if AVX-512 F, VL, BW, DQ were detected; no memory is touched.
         unsafe { $call }
     };
 }
@@ -86,7 +85,7 @@ impl Simd for Avx512 {
         fn with_avx512<K: Kernel>(kernel: K, simd: Avx512) -> K::Output {
             kernel.run(simd)
         }
-        // SAFETY: `self` is proof of every feature named.
+        // SAFETY: `self` proves every feature that is named.
         unsafe { with_avx512(kernel, self) }
     }
 
@@ -98,15 +97,14 @@ impl Simd for Avx512 {
     #[inline(always)]
     fn load(self, values: &[f32]) -> F32x16 {
         let values = &values[..LANES];
-        // SAFETY: sixteen floats are there; the load needs no alignment. `self` proves AVX-512.
+        // SAFETY: the slice has sixteen floats; the load needs no alignment. `self` proves AVX-512.
         F32x16(unsafe { _mm512_loadu_ps(values.as_ptr()) })
     }
 
     #[inline(always)]
     fn load_f16(self, values: &[u16]) -> F32x16 {
         let values = &values[..LANES];
-        // SAFETY: sixteen 16-bit numbers are there; the load needs no alignment. `self` proves
-        // AVX-512.
+        // SAFETY: the slice has sixteen 16-bit numbers; the load needs no alignment. `self` proves AVX-512.
         F32x16(unsafe { _mm512_cvtph_ps(_mm256_loadu_si256(values.as_ptr().cast())) })
     }
 
@@ -150,7 +148,7 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn exp2(self, a: F32x16) -> F32x16 {
-        // What is above the whole number below, which is what the scaling rounds to.
+        // Fraction above the value rounded down; the scaling rounds down in the same way.
         const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
         let f = F32x16(proven!(_mm512_reduce_ps::<DOWN>(a.0)));
         let p = self.mul_add(self.splat(EXP2[4]), f, self.splat(EXP2[3]));
@@ -197,7 +195,7 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn bit_planes(self, bytes: &[u8; 64]) -> [u64; 8] {
-        // SAFETY: 64 bytes are there; the load needs no alignment. `self` proves AVX-512.
+        // SAFETY: the array has 64 bytes; the load needs no alignment. `self` proves AVX-512.
         let bytes = unsafe { _mm512_loadu_si512(bytes.as_ptr().cast()) };
         std::array::from_fn(|bit| {
             proven!(_mm512_test_epi8_mask(bytes, _mm512_set1_epi8((1u8 << bit) as i8)))
@@ -206,7 +204,7 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn prefetch<T>(self, value: &T) {
-        // SAFETY: a prefetch is a hint without effect on memory; the address is a live reference's.
+        // SAFETY: a prefetch is a hint without effect on memory, and the address is that of a live reference.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()) }
     }
 }

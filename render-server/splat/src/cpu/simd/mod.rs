@@ -1,8 +1,8 @@
-//! Vectors of f32 for the passes: one trait, one file per instruction set, and the choice.
+//! Vectors of f32 for the passes: a trait, one file per instruction set, and runtime selection.
 //!
-//! A pass is written once, generic over [`Simd`], as a [`Kernel`]. A value of an instruction set's
-//! type exists only where the processor has it, so its methods are safe to call; [`Simd::run`]
-//! compiles the kernel for that set. All unsafe code of the renderer is in this folder.
+//! A pass is written once, generic over [`Simd`], as a [`Kernel`]. A value of an instruction set's type exists only
+//! if the processor supports it, so its methods are safe to call. [`Simd::run`] compiles the kernel for that set. All
+//! unsafe code of the renderer is in this folder.
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
@@ -27,7 +27,7 @@ pub use portable::Portable;
 
 /// Operations on one vector of f32. Comparisons with NaN are false.
 pub trait Simd: Copy + Send + Sync + 'static {
-    /// [`Self::LANES`] numbers.
+    /// Vector of [`Self::LANES`] numbers.
     type F: Copy
         + Add<Output = Self::F>
         + Sub<Output = Self::F>
@@ -36,7 +36,7 @@ pub trait Simd: Copy + Send + Sync + 'static {
     /// One flag per lane.
     type M: Copy + BitAnd<Output = Self::M>;
 
-    /// Lanes of a vector: 8 or 16.
+    /// Number of lanes of a vector: 8 or 16.
     const LANES: usize;
 
     /// Runs a kernel, compiled for this instruction set.
@@ -44,11 +44,11 @@ pub trait Simd: Copy + Send + Sync + 'static {
 
     /// Returns a vector of one value.
     fn splat(self, value: f32) -> Self::F;
-    /// Loads the first lanes' worth of `values`.
+    /// Loads the first `LANES` values.
     fn load(self, values: &[f32]) -> Self::F;
-    /// Loads the first lanes' worth of half-precision `values`.
+    /// Loads the first `LANES` half-precision values.
     fn load_f16(self, values: &[u16]) -> Self::F;
-    /// Stores to the first lanes' worth of `out`.
+    /// Stores to the first `LANES` elements of `out`.
     fn store(self, v: Self::F, out: &mut [f32]);
 
     /// Returns `a * b + c`.
@@ -61,12 +61,12 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn max(self, a: Self::F, b: Self::F) -> Self::F;
     /// Returns the square root.
     fn sqrt(self, a: Self::F) -> Self::F;
-    /// Returns the greatest whole number that is not greater.
+    /// Returns the value rounded down to a whole number.
     fn floor(self, a: Self::F) -> Self::F;
-    /// Returns `2^a` within 3e-6 relative for `a` in -126 to 127; anything, but no trap, beyond.
+    /// Returns `2^a` within 3e-6 relative for `a` in -126 to 127; unspecified outside, but without a trap.
     fn exp2(self, a: Self::F) -> Self::F;
-    /// Returns the binary logarithm within 1e-6 for positive `a`; -127 of 0. Plain code, which compiles to the set's
-    /// instructions where it is inlined.
+    /// Returns the binary logarithm within 1e-6 for positive `a`, and -127 for 0. Plain code that compiles to the
+    /// set's instructions when inlined.
     #[inline(always)]
     fn log2(self, a: Self::F) -> Self::F {
         let mut lanes = [1.0; 16];
@@ -79,19 +79,19 @@ pub trait Simd: Copy + Send + Sync + 'static {
     /// Returns the sum of all lanes.
     fn sum(self, a: Self::F) -> f32;
 
-    /// Returns where `a < b`.
+    /// Returns the mask of lanes with `a < b`.
     fn lt(self, a: Self::F, b: Self::F) -> Self::M;
     /// Returns `a` where the flag is set, else `b`.
     fn select(self, m: Self::M, a: Self::F, b: Self::F) -> Self::F;
     /// Returns `a` where the flag is set, else 0.
     fn keep(self, m: Self::M, a: Self::F) -> Self::F;
-    /// Returns the flags as bits, lane 0 lowest.
+    /// Returns the flags as bits, lane 0 in the lowest bit.
     fn bits(self, m: Self::M) -> u32;
-    /// Whether any flag is set.
+    /// Returns whether any flag is set.
     fn any(self, m: Self::M) -> bool;
 
-    /// Returns, for each bit of a byte, lowest first, which of the bytes have it: the first byte lowest. Plain code, as
-    /// [`Self::log2`].
+    /// Returns, for each bit position from the lowest, which of the bytes have that bit set; the first byte is the
+    /// lowest bit. Plain code, like [`Self::log2`].
     #[inline(always)]
     fn bit_planes(self, bytes: &[u8; 64]) -> [u64; 8] {
         let mut planes = [0; 8];
@@ -104,28 +104,27 @@ pub trait Simd: Copy + Send + Sync + 'static {
         planes
     }
 
-    /// Asks for the cache line at `value`, to be read soon.
+    /// Prefetches the cache line at `value`.
     fn prefetch<T>(self, value: &T);
 }
 
-/// A piece of a pass, to be compiled for each instruction set. `run` is marked
-/// `#[inline(always)]`, and so is what it calls: only then does it take on the set's instructions.
+/// Piece of a pass that is compiled for each instruction set. `run` and all functions that it calls are marked
+/// `#[inline(always)]`, because only inlined code is compiled with the set's instructions.
 pub trait Kernel {
-    /// What it returns.
+    /// Result of the kernel.
     type Output;
-    /// Does the work.
+    /// Runs the kernel.
     fn run<S: Simd>(self, simd: S) -> Self::Output;
 }
 
-/// Coefficients of `2^f` on [-1/2, 1/2], minimax in relative error: 2.6e-6 (fitted by reweighted
-/// least squares). An alpha off by that share shows at 110 dB, and a term fewer is a cycle less in
-/// the innermost loop.
+/// Coefficients of `2^f` on [-1/2, 1/2], minimax in relative error: 2.6e-6 (fitted by reweighted least squares). An
+/// alpha with this relative error changes an image at 110 dB. One term less saves a cycle in the innermost loop.
 const EXP2: [f32; 5] = [0.999_999_3, 0.693_121_8, 0.240_247_45, 0.055_917_86, 0.009_570_1];
 
-/// Returns the binary logarithm of a number that is not negative, without branches.
+/// Returns the binary logarithm of a non-negative number, without branches.
 #[inline(always)]
 fn log2(a: f32) -> f32 {
-    // The exponent for which the rest is within sqrt(1/2) to sqrt(2).
+    // Exponent for which the mantissa is within sqrt(1/2) to sqrt(2).
     let exponent = (a.to_bits().wrapping_sub(FRAC_1_SQRT_2.to_bits()) as i32) >> 23;
     let rest = f32::from_bits(a.to_bits().wrapping_sub((exponent << 23) as u32));
     // log2 r = 2 / ln 2 atanh s, with s below 0.172: the series' next term is below 5e-8.
@@ -135,7 +134,7 @@ fn log2(a: f32) -> f32 {
     exponent as f32 + 2.0 * std::f32::consts::LOG2_E * s * series
 }
 
-/// Transposes 8x8 bits, a byte a row: by halves, quarters and eighths (Warren 2012, "Hacker's Delight", 7-3).
+/// Transposes 8x8 bits, one byte per row: by halves, quarters and eighths (Warren 2012, "Hacker's Delight", 7-3).
 #[inline(always)]
 fn transpose(rows: u64) -> u64 {
     let mut bits = rows;
@@ -148,24 +147,24 @@ fn transpose(rows: u64) -> u64 {
     bits
 }
 
-/// The instruction sets this build can dispatch to.
+/// Instruction sets that this build supports.
 #[derive(Clone, Copy, Debug)]
 pub enum InstructionSet {
-    /// Sixteen lanes.
+    /// AVX-512, 16 lanes.
     #[cfg(target_arch = "x86_64")]
     Avx512(Avx512),
-    /// Eight lanes.
+    /// AVX2, 8 lanes.
     #[cfg(target_arch = "x86_64")]
     Avx2(Avx2),
-    /// Twice four lanes.
+    /// NEON, two registers of 4 lanes.
     #[cfg(target_arch = "aarch64")]
     Neon(Neon),
-    /// Arrays of eight.
+    /// Plain arrays of 8 lanes.
     Portable(Portable),
 }
 
 impl InstructionSet {
-    /// Returns every set this processor has, fastest first; never empty.
+    /// Returns the sets that this processor supports, fastest first; never empty.
     pub fn available() -> Vec<Self> {
         #[cfg(target_arch = "x86_64")]
         let wide = [Avx512::detect().map(Self::Avx512), Avx2::detect().map(Self::Avx2)];
@@ -176,7 +175,7 @@ impl InstructionSet {
         wide.into_iter().flatten().chain([Self::Portable(Portable)]).collect()
     }
 
-    /// Returns the lanes of its vectors: 8 or 16.
+    /// Returns the number of lanes of its vectors: 8 or 16.
     pub fn lanes(self) -> usize {
         match self {
             #[cfg(target_arch = "x86_64")]
@@ -202,7 +201,7 @@ impl InstructionSet {
         }
     }
 
-    /// Returns the name for reports.
+    /// Returns the name for reports: `cpu avx2`.
     pub fn name(self) -> &'static str {
         match self {
             #[cfg(target_arch = "x86_64")]

@@ -13,7 +13,7 @@ use std::ops::{Add, BitAnd, Div, Mul, Sub};
 
 use super::{EXP2, Kernel, Simd};
 
-/// The set itself needs no detection: it is part of the architecture.
+/// NEON instruction set. Needs no detection, because it is part of the architecture.
 #[derive(Clone, Copy, Debug)]
 pub struct Neon;
 
@@ -22,14 +22,14 @@ const LANES: usize = 8;
 #[derive(Clone, Copy)]
 pub struct F32x8([float32x4_t; 2]);
 
-/// All bits of a lane set or none.
+/// Mask: all bits of a lane are set or none.
 #[derive(Clone, Copy)]
 pub struct Mask8([uint32x4_t; 2]);
 
 /// Calls an intrinsic.
 macro_rules! neon {
     ($call:expr) => {
-        // SAFETY: every aarch64 processor that this is compiled for has NEON; no memory is touched.
+        // SAFETY: every aarch64 processor for which this is compiled has NEON; no memory is touched.
         unsafe { $call }
     };
 }
@@ -62,11 +62,11 @@ impl BitAnd for Mask8 {
     }
 }
 
-/// Half to single precision, four at once; exact but for infinities and NaN, which never occur. By
-/// whole numbers, since the instruction needs a type that is not stable yet.
+/// Converts four half to single precision; exact except for infinities and NaN, which never occur. Uses integers,
+/// because the instruction needs a type that is not stable yet.
 #[inline(always)]
 fn from_f16(halves: uint32x4_t) -> float32x4_t {
-    /// 2^112: the difference of the exponents' biases.
+    /// 2^112: difference of the exponent biases.
     const REBIAS: f32 = f32::from_bits((127 + 112) << 23);
     neon!({
         let magnitude = vshlq_n_u32::<13>(vandq_u32(halves, vdupq_n_u32(0x7fff)));
@@ -79,7 +79,7 @@ fn from_f16(halves: uint32x4_t) -> float32x4_t {
 /// Returns `2^a`, as [`Simd::exp2`] specifies.
 #[inline(always)]
 fn exp2(a: float32x4_t) -> float32x4_t {
-    /// 1.5 * 2^23: adding it rounds to a whole number, held in the low bits.
+    /// 1.5 * 2^23: adding it rounds to a whole number, which is in the low bits.
     const ROUND: f32 = 12_582_912.0;
     neon!({
         let round = vdupq_n_f32(ROUND);
@@ -113,14 +113,14 @@ impl Simd for Neon {
     #[inline(always)]
     fn load(self, values: &[f32]) -> F32x8 {
         let at = values[..LANES].as_ptr();
-        // SAFETY: eight floats are there; the load needs no alignment beyond theirs.
+        // SAFETY: the slice has eight floats; the load needs only their alignment.
         F32x8(unsafe { [vld1q_f32(at), vld1q_f32(at.add(4))] })
     }
 
     #[inline(always)]
     fn load_f16(self, values: &[u16]) -> F32x8 {
         let at = values[..LANES].as_ptr();
-        // SAFETY: eight 16-bit numbers are there; the load needs no alignment beyond theirs.
+        // SAFETY: the slice has eight 16-bit numbers; the load needs only their alignment.
         let halves = unsafe { vld1q_u16(at) };
         let [low, high] =
             neon!([vmovl_u16(vget_low_u16(halves)), vmovl_u16(vget_high_u16(halves))]);
@@ -130,7 +130,7 @@ impl Simd for Neon {
     #[inline(always)]
     fn store(self, v: F32x8, out: &mut [f32]) {
         let at = out[..LANES].as_mut_ptr();
-        // SAFETY: there is room for eight floats; the store needs no alignment beyond theirs.
+        // SAFETY: the slice has room for eight floats; the store needs only their alignment.
         unsafe {
             vst1q_f32(at, v.0[0]);
             vst1q_f32(at.add(4), v.0[1]);
@@ -205,11 +205,11 @@ impl Simd for Neon {
 
     #[inline(always)]
     fn bits(self, m: Mask8) -> u32 {
-        /// The bit of each lane.
+        /// Bit of each lane.
         const BITS: [u32; LANES] = [1, 2, 4, 8, 16, 32, 64, 128];
-        // SAFETY: eight numbers are there.
+        // SAFETY: the array has eight numbers.
         let bits = unsafe { [vld1q_u32(BITS.as_ptr()), vld1q_u32(BITS.as_ptr().add(4))] };
-        // No bit is in both, so the sum is the union.
+        // The bits are disjoint, so the sum is the union.
         neon!(vaddvq_u32(vorrq_u32(vandq_u32(m.0[0], bits[0]), vandq_u32(m.0[1], bits[1]))))
     }
 
@@ -220,7 +220,7 @@ impl Simd for Neon {
 
     #[inline(always)]
     fn prefetch<T>(self, value: &T) {
-        // SAFETY: a prefetch is a hint without effect on memory; the address is a live reference's.
+        // SAFETY: a prefetch is a hint without effect on memory, and the address is that of a live reference.
         unsafe {
             std::arch::asm!(
                 "prfm pldl1keep, [{}]",

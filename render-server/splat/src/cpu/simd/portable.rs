@@ -1,11 +1,11 @@
-//! Plain arrays that the compiler vectorises for whatever the target always has.
+//! Plain arrays, which the compiler vectorises with the target's baseline instructions.
 
 use std::array;
 use std::ops::{Add, BitAnd, Div, Mul, Sub};
 
 use super::{EXP2, Kernel, Simd};
 
-/// Needs nothing.
+/// Portable instruction set; needs no processor features.
 #[derive(Clone, Copy, Debug)]
 pub struct Portable;
 
@@ -14,7 +14,7 @@ const LANES: usize = 8;
 #[derive(Clone, Copy)]
 pub struct F32x8([f32; LANES]);
 
-/// All bits of a lane set or none: what vector comparisons give.
+/// Mask: all bits of a lane are set or none, like the result of vector comparisons.
 #[derive(Clone, Copy)]
 pub struct Mask8([u32; LANES]);
 
@@ -44,7 +44,7 @@ impl BitAnd for Mask8 {
     }
 }
 
-/// Fused where that is one instruction; elsewhere it would be a call.
+/// Fused if that is one instruction; on other targets it would be a function call.
 #[inline(always)]
 fn mul_add(a: f32, b: f32, c: f32) -> f32 {
     if cfg!(any(target_arch = "aarch64", target_feature = "fma")) {
@@ -54,10 +54,10 @@ fn mul_add(a: f32, b: f32, c: f32) -> f32 {
     }
 }
 
-/// Half to single precision without branches; exact but for infinities and NaN, which never occur.
+/// Converts half to single precision without branches; exact except for infinities and NaN, which never occur.
 #[inline(always)]
 fn from_f16(half: u16) -> f32 {
-    /// 2^112: the difference of the exponents' biases.
+    /// 2^112: difference of the exponent biases.
     const REBIAS: f32 = f32::from_bits((127 + 112) << 23);
     let magnitude = f32::from_bits(u32::from(half & 0x7fff) << 13) * REBIAS;
     f32::from_bits(magnitude.to_bits() | (u32::from(half & 0x8000) << 16))
@@ -128,7 +128,7 @@ impl Simd for Portable {
 
     #[inline(always)]
     fn exp2(self, a: F32x8) -> F32x8 {
-        /// 1.5 * 2^23: adding it rounds to a whole number, held in the low bits.
+        /// 1.5 * 2^23: adding it rounds to a whole number, which is in the low bits.
         const ROUND: f32 = 12_582_912.0;
         F32x8(a.0.map(|x| {
             let rounded = x + ROUND;

@@ -69,7 +69,7 @@ impl Kernel for Check {
             }
         }
 
-        // All finite halves, subnormal ones too.
+        // All finite halves, including subnormal ones.
         for chunk in (0..=u16::MAX).collect::<Vec<_>>().chunks(16) {
             let finite: Vec<u16> =
                 chunk.iter().map(|&h| if h & 0x7c00 == 0x7c00 { 0 } else { h }).collect();
@@ -85,7 +85,7 @@ impl Kernel for Check {
 }
 
 #[test]
-fn every_set_computes_what_plain_arithmetic_does() {
+fn every_set_matches_plain_arithmetic() {
     for set in InstructionSet::available() {
         match set {
             #[cfg(target_arch = "x86_64")]

@@ -1,15 +1,15 @@
-//! A packed scene: a file from which single blocks can be read, and what of it stays in memory.
+//! File format of packed scenes, from which single blocks can be read, and its tables in memory.
 //!
 //! ```text
 //! header    48 bytes: magic, version, parts, blocks, splats, allowed error, anti-aliasing, checksum
-//! blocks    part by part, level by level: geometry, then harmonics, as `scene::Part` has them
+//! blocks    part by part, level by level: geometry, then harmonics, in the layout of `scene::Part`
 //! parts     8 bytes each: blocks of the finest level, degree of the harmonics
 //! blocks    36 bytes each: bounds, error, checksum of the block's bytes
 //! ```
-//! All numbers are little-endian. The number of blocks of the finest level determines those of the coarser ones, and so the
-//! place of every block in the file: nothing points anywhere. Tables stand at the end, so that a scene is written as it
-//! is read, part after part. Checksums (CRC-32 of ISO 3309) tell damage, not malice: what a stranger may have written is
-//! held to what the renderer takes, besides.
+//! All numbers are little-endian. The number of blocks of the finest level determines the numbers of the coarser
+//! ones, and so the position of every block in the file: the file contains no offsets. The tables are at the end, so
+//! that a scene is written in one pass, part by part. Checksums (CRC-32 of ISO 3309) detect damage, not manipulation.
+//! For untrusted files, all values are also validated against the renderer's limits.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
@@ -23,71 +23,71 @@ use super::super::scene::{BLOCK, Block, GROUP, GROUP_NUMBERS, Part, column};
 use crate::Splats;
 use crate::format::{self, FormatError};
 
-/// The first bytes of the file.
+/// Magic number: the first bytes of the file.
 pub(crate) const MAGIC: &[u8; 8] = b"VFPACKED";
 const VERSION: u32 = 1;
-/// Bytes of the header.
+/// Header size. [byte]
 const HEADER: usize = 48;
-/// Bytes of the header that the checksum covers, before the tables.
+/// Header bytes that the checksum covers, before the tables. [byte]
 const CHECKED: usize = 40;
-/// Bytes of a part in its table.
+/// Size of a part in its table. [byte]
 const PART: usize = 8;
-/// Bytes of a block in its table.
+/// Size of a block in its table. [byte]
 const ROW: usize = 36;
-/// Numbers of a block's geometry.
+/// Number of values of a block's geometry.
 pub(super) const GEOMETRY: usize = BLOCK / GROUP * GROUP_NUMBERS;
-/// Highest degree of harmonics.
+/// Maximum degree of the harmonics.
 const MAX_DEGREE: u32 = 3;
 
-/// Where a packed scene is read from: a file, or bytes in memory.
+/// Input of a packed scene: a file, or bytes in memory.
 pub trait Source: Read + Seek + Send {}
 
 impl<T: Read + Seek + Send> Source for T {}
 
-/// Why a scene cannot be packed, or a packed scene not be used.
+/// Why a scene cannot be packed, or a packed scene cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PackedError {
-    /// The operating system refused.
+    /// I/O error of the operating system.
     #[error("cannot {verb} {}: {cause}", path.display())]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// `read` or `write`.
         verb: &'static str,
-        /// The system's error.
+        /// Error of the operating system.
         cause: io::Error,
     },
-    /// The file is cut, damaged, or no packed scene.
+    /// File is truncated, damaged, or not a packed scene.
     #[error("packed scene, {place}: {reason}")]
     Invalid {
-        /// A part of the file.
+        /// Invalid section of the file.
         place: String,
-        /// What is wrong there.
+        /// Reason.
         reason: String,
     },
-    /// The scene to pack is refused.
+    /// Scene to pack is invalid.
     #[error(transparent)]
     Scene(#[from] FormatError),
-    /// The thread that reads does not start.
-    #[error("no thread to read the scene with: {0}")]
+    /// Reader thread cannot be started.
+    #[error("cannot start the thread that reads the scene: {0}")]
     Thread(io::Error),
-    /// More splats where they are to be in memory one by one than were allowed.
+    /// Box contains more splats than allowed in memory.
     #[error("more than {most} splats lie between {min_m} and {max_m} m")]
     Crowded {
-        /// As many were allowed.
+        /// Maximum number of splats.
         most: usize,
-        /// A corner of the box. [m]
+        /// Minimum corner of the box. [m]
         min_m: Vec3,
-        /// The corner opposite. [m]
+        /// Maximum corner of the box. [m]
         max_m: Vec3,
     },
-    /// Less memory than the coarsest blocks of all parts take.
+    /// Memory is less than the coarsest blocks of all parts need.
     #[error("{given} bytes of memory are too few for this scene; it needs {least} at least")]
     Memory {
-        /// Bytes given.
+        /// Available memory. [byte]
         given: usize,
-        /// Bytes needed.
+        /// Minimum memory. [byte]
         least: usize,
     },
 }
@@ -96,15 +96,15 @@ fn invalid(place: impl Into<String>, reason: impl Into<String>) -> PackedError {
     PackedError::Invalid { place: place.into(), reason: reason.into() }
 }
 
-/// The levels of one part of the scene: a tree of blocks, as [`super::super::detail`] makes it.
+/// Levels of one part of the scene: a tree of blocks, as [`super::super::detail`] builds it.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Tree {
-    /// Its first block among all.
+    /// Index of its first block among all blocks.
     pub(super) first: usize,
-    /// The first block of each level, counted from `first`; one past the last block at the end.
+    /// First block of each level, relative to `first`; then the end of the last level.
     pub(super) levels: Vec<usize>,
     coefficients: usize,
-    /// Where its blocks stand in the file. [byte]
+    /// Offset of its blocks in the file. [byte]
     at: u64,
 }
 
@@ -118,12 +118,12 @@ impl Tree {
         Self { first, levels, coefficients, at }
     }
 
-    /// Returns how many blocks it has.
+    /// Returns the number of blocks.
     fn len(&self) -> usize {
         self.levels[self.levels.len() - 1]
     }
 
-    /// Returns the number, among all, of the block that stands for the whole part.
+    /// Returns the index, among all blocks, of the block that represents the whole part.
     pub(super) fn top(&self) -> usize {
         self.first + self.len() - 1
     }
@@ -133,18 +133,18 @@ impl Tree {
     }
 }
 
-/// Returns how many bytes a block with so many coefficients a colour takes.
+/// Returns the size of a block with `coefficients` coefficients per colour. [byte]
 pub(super) fn block_bytes(coefficients: usize) -> usize {
     GEOMETRY * 4 + coefficients * 3 * BLOCK * 2
 }
 
-/// A packed scene, opened: the bounds of all its blocks, some 40 bytes per 256 splats.
+/// Opened packed scene, with the bounds of all its blocks: about 40 bytes per 256 splats.
 pub struct PackedScene {
     pub(super) trees: Vec<Tree>,
-    /// All parts' blocks.
+    /// Blocks of all parts.
     pub(super) blocks: Vec<Block>,
     checks: Vec<u32>,
-    /// Coefficients a colour, of the part that has most.
+    /// Maximum number of coefficients per colour of all parts.
     pub(super) coefficients: usize,
     pub(super) antialiased: bool,
     pub(super) max_error_px: f32,
@@ -160,11 +160,11 @@ impl std::fmt::Debug for PackedScene {
 }
 
 impl PackedScene {
-    /// Whether a file starts as a packed scene does.
+    /// Returns whether a file starts with the magic number of a packed scene.
     pub fn is_packed(path: impl AsRef<Path>) -> bool {
         let path = path.as_ref();
         let mut start = [0; MAGIC.len()];
-        // Asked before it is opened: a pipe would wait there for its writer.
+        // Checked before opening: opening a pipe would block until it has a writer.
         path.is_file()
             && File::open(path).and_then(|mut file| file.read_exact(&mut start)).is_ok()
             && start == *MAGIC
@@ -173,22 +173,22 @@ impl PackedScene {
     /// Opens a packed scene.
     ///
     /// # Errors
-    /// It cannot be read, is cut, damaged, or no packed scene.
+    /// If the file cannot be read, is truncated or damaged, or is not a packed scene.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, PackedError> {
         let path = path.as_ref();
         let file = File::open(path).map_err(|cause| read_error(path, cause))?;
         Self::from_source(Box::new(file))
     }
 
-    /// [`Self::open`], of bytes anywhere.
+    /// Opens a packed scene from any source.
     ///
     /// # Errors
-    /// As [`Self::open`].
+    /// Same as [`Self::open`].
     pub fn from_source(mut source: Box<dyn Source>) -> Result<Self, PackedError> {
         let io = |cause| read_error(Path::new("the packed scene"), cause);
         let len = source.seek(SeekFrom::End(0)).map_err(io)?;
         if len < HEADER as u64 {
-            return Err(invalid("header", format!("the file has {len} bytes alone")));
+            return Err(invalid("header", format!("the file has only {len} bytes")));
         }
         source.rewind().map_err(io)?;
         let mut header = [0; HEADER];
@@ -196,7 +196,7 @@ impl PackedScene {
         if !header.starts_with(MAGIC) {
             return Err(invalid(
                 "header",
-                "this is no packed scene; `vizflyt scene pack` makes one",
+                "this is not a packed scene; `vizflyt scene pack` makes one",
             ));
         }
         let mut fields = Fields(&header[MAGIC.len()..]);
@@ -209,7 +209,8 @@ impl PackedScene {
         if !(max_error_px > 0.0 && max_error_px.is_finite()) || antialiased > 1 {
             return Err(invalid("header", "numbers that no packing writes"));
         }
-        // Every part has a block, and every block more than its row: a file holds what it claims, or is refused.
+        // Every part has a block, and every block is larger than its row: reject files that are too small for their
+        // counts.
         let tables =
             parts.saturating_mul(PART as u64).saturating_add(blocks.saturating_mul(ROW as u64));
         if parts == 0
@@ -253,27 +254,27 @@ impl PackedScene {
         Ok(scene)
     }
 
-    /// Returns the number of splats that can be seen at all.
+    /// Returns the number of visible splats.
     pub fn len(&self) -> usize {
         self.splats
     }
 
-    /// Whether there are none.
+    /// Whether the scene has no splats.
     pub fn is_empty(&self) -> bool {
         self.splats == 0
     }
 
-    /// Returns how many parts it was packed of.
+    /// Returns the number of parts.
     pub fn parts(&self) -> usize {
         self.trees.len()
     }
 
-    /// Returns how far splats may be rendered from where they are, as it was packed for. [px]
+    /// Returns the allowed error of splats for which the scene was packed. [px]
     pub fn max_error_px(&self) -> f32 {
         self.max_error_px
     }
 
-    /// Reads a block: `geometry` and `sh` as [`Part`] has them; harmonics that its part lacks are 0.
+    /// Reads a block into `geometry` and `sh`, in the layout of [`Part`]. Harmonics that its part lacks are set to 0.
     pub(super) fn read(
         &mut self,
         block: usize,
@@ -312,7 +313,7 @@ impl PackedScene {
     }
 }
 
-/// Reads the table of parts; returns them, and how many bytes their blocks take.
+/// Reads the table of parts. Returns the parts and the size of their blocks in bytes.
 fn read_trees(
     fields: &mut Fields<'_>,
     parts: usize,
@@ -350,14 +351,14 @@ fn read_row(block: usize, fields: &mut Fields<'_>) -> Result<Block, PackedError>
         reach_m: fields.f32(),
         error_m: fields.f32(),
     };
-    // Numbers that are not finite keep a block in view; an error of NaN would stand above its finer level.
+    // Bounds that are not finite keep a block in view. A NaN error would select it over its finer level.
     if row.error_m.is_nan() {
-        return Err(invalid(format!("block {block}"), "its error is no number"));
+        return Err(invalid(format!("block {block}"), "its error is not a number"));
     }
     Ok(row)
 }
 
-/// Little-endian numbers, from the front; there are as many as are asked for.
+/// Reader of little-endian numbers. The caller checks the length in advance.
 struct Fields<'a>(&'a [u8]);
 
 impl Fields<'_> {
@@ -397,23 +398,23 @@ fn read_error(path: &Path, cause: io::Error) -> PackedError {
     PackedError::Io { path: path.to_owned(), verb: "read", cause }
 }
 
-/// What was packed.
+/// Statistics of a packing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct PackSummary {
-    /// Parts, each with a tree of its own.
+    /// Parts, each with its own tree.
     pub parts: usize,
-    /// Splats that can be seen at all.
+    /// Visible splats.
     pub splats: usize,
     /// Blocks of all levels.
     pub blocks: usize,
 }
 
-/// Packs a scene file of any format, a streamed scene chunk by chunk: memory is that of the largest. Coarser levels are
-/// made for errors of so many pixels ([`Detail::Adaptive`]). `place` may move the splats of a chunk, or leave some out; `report`
-/// hears of every chunk.
+/// Packs a scene file of any format. A streamed scene is packed chunk by chunk, so that memory depends on the largest
+/// chunk. Coarser levels are made for errors of `max_error_px` ([`Detail::Adaptive`]). `place` may move or remove
+/// splats of a chunk; `report` is called for every chunk.
 ///
 /// # Errors
-/// The scene cannot be read or the file not be written; chunks that are not all trained with anti-aliasing, or none.
+/// If the scene cannot be read, the file cannot be written, or only some chunks are trained with anti-aliasing.
 pub fn pack(
     from: &Path,
     to: &Path,
@@ -445,27 +446,27 @@ pub fn pack(
             Ok(summary)
         }
         Err(error) => {
-            // Half a file helps nobody.
+            // An incomplete file is useless.
             let _ = std::fs::remove_file(&partial);
             Err(error)
         }
     }
 }
 
-/// Writes a packed scene, part by part.
+/// Writer of a packed scene, part by part.
 pub(super) struct Packer<W> {
     out: W,
     max_error_px: f32,
     antialiased: Option<bool>,
-    /// Blocks of the finest level, degree.
+    /// Per part: blocks of the finest level, degree.
     parts: Vec<[u32; 2]>,
-    /// Of all blocks.
+    /// Table rows of all blocks.
     rows: Vec<u8>,
     summary: PackSummary,
     bytes: Vec<u8>,
 }
 
-/// Why a part is not added.
+/// Why a part cannot be added.
 #[derive(Debug)]
 pub(super) enum AddError {
     Io(io::Error),
@@ -486,7 +487,7 @@ impl<W: Write + Seek> Packer<W> {
         })
     }
 
-    /// Adds a part, unless it has nothing to see.
+    /// Adds a part; skips it if it has no visible splats.
     pub(super) fn add(&mut self, splats: &Splats) -> Result<(), AddError> {
         let part = Part::new(0, splats, Detail::Adaptive { max_error_px: self.max_error_px });
         if part.len == 0 {
@@ -521,10 +522,13 @@ impl<W: Write + Seek> Packer<W> {
         Ok(())
     }
 
-    /// Writes tables and header.
+    /// Writes the tables and the header.
     pub(super) fn finish(mut self) -> io::Result<PackSummary> {
         if self.parts.is_empty() {
-            return Err(io::Error::new(io::ErrorKind::InvalidData, "the scene has nothing to see"));
+            return Err(io::Error::new(
+                io::ErrorKind::InvalidData,
+                "the scene has no visible splats",
+            ));
         }
         let mut tables: Vec<u8> = Vec::with_capacity(self.parts.len() * PART + self.rows.len());
         tables.extend(self.parts.as_flattened().iter().flat_map(|number| number.to_le_bytes()));

@@ -1,17 +1,17 @@
-//! A scene larger than memory: blocks come from a packed file as images need them, into a pool of fixed size.
+//! Renderer of scenes larger than memory: loads blocks from a packed file on demand, into a pool of fixed size.
 //!
 //! ```text
 //! walk over all trees -> blocks drawn, blocks missing -> reader -> slots of the pool (a `Part`) -> project, sort, ...
 //! ```
-//! The bounds of all blocks stay in memory, so that the walk is that of `cull`: where a block is off by too many pixels,
-//! those that it stands for are drawn in its place. Those of them in view must all be there; as long as one is not, the coarser
-//! block stands in, so that nothing is drawn twice or left out. What is missing on the way down is asked for at once, level
-//! below level, what is off by most pixels first; then what comes into view or is to be finer soon, where there is room for
-//! it. The coarsest block of each part is always there. When all that an image
-//! needs is in the pool, it is bit by bit the image of the same parts in memory.
+//! The bounds of all blocks stay in memory, so the walk is the same as that of `cull`: where a block's error exceeds
+//! the allowed pixels, its children are drawn instead. All of its visible children must be in the pool; until then,
+//! the coarser block stands in, so that nothing is drawn twice or missing. The walk requests missing blocks of all
+//! levels at once, those with the greatest error first. Then it requests blocks that will come into view or be
+//! refined soon, if there is room. The coarsest block of each part is always in the pool. If all blocks that an image
+//! needs are in the pool, the image is bit-identical to that of the same parts in memory.
 //!
-//! The pool gives the slot to a new block that was needed longest ago, never one that this image needs: what does not fit
-//! stays coarse, and nothing is read only to be thrown away.
+//! A new block replaces the block that was needed least recently, never one that the current image needs. Blocks that
+//! do not fit are drawn coarser, and no block is read only to be dropped again.
 
 mod file;
 mod near;
@@ -30,57 +30,57 @@ use reader::{Arrived, Reader};
 
 use crate::Camera;
 
-/// What an image does about blocks that are not in memory.
+/// How an image handles blocks that are not in memory.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Loading {
-    /// It is drawn with coarser ones in their place, and waits for nothing.
+    /// Draws coarser blocks instead, without waiting.
     #[default]
     Live,
-    /// It waits until all are there.
+    /// Waits until all blocks are in memory.
     Whole,
 }
 
-/// The pool among the parts that are rendered: what stands still.
+/// Index of the pool among the rendered parts: the static part.
 const POOL: u32 = 0;
-/// What is drawn by a block that is off by more than this share of what is allowed is asked for already: at 10 m/s and 50 m
-/// half a second before.
+/// Blocks are requested when the error of the drawn block exceeds this share of the allowed error: at 10 m/s and 50
+/// m, half a second in advance.
 const SOON_SHARE: f32 = 0.9;
-/// Of the image's sides, what is looked at beyond each for what comes into view: a quarter of it, half a second of a slow
-/// turn.
+/// Margin around the image, as a share of its sides, in which blocks are requested before they come into view: half a
+/// second of a slow turn.
 const BEYOND: f64 = 0.25;
-/// Asked for at most, at once: more than arrives until the next image.
+/// Maximum number of requested blocks: more than arrive until the next image.
 const MAX_WANTED: usize = 4096;
-/// Of a block that is not in the pool.
+/// Slot of a block that is not in the pool.
 const ABSENT: u32 = u32::MAX;
-/// Seen by every image: never replaced.
+/// Value of `needed` of a block that is never replaced: the top blocks, which every image needs.
 const ALWAYS: u64 = u64::MAX;
 
-/// A slot of the pool, and when its block was last needed.
+/// Slot of the pool, with the last image that needed its block.
 #[derive(Clone, Copy, Debug)]
 struct Slot {
     block: u32,
-    /// Number of the image.
+    /// Image number.
     needed: u64,
 }
 
-/// The part of a packed scene that is in memory, and what keeps it up to date.
+/// Pool of a packed scene, with its reader.
 #[derive(Debug)]
 pub(super) struct Streamed {
     trees: Vec<Tree>,
     blocks: Vec<Block>,
     loading: Loading,
-    /// As the scene was packed for. [px]
+    /// Allowed error for which the scene was packed. [px]
     max_error_px: f32,
-    /// How many times that is allowed, for what an image needs to fit.
+    /// Factor on the allowed error, above 1 if the blocks of an image do not fit.
     relief: f32,
-    /// Per block.
+    /// Slot of each block.
     slot_of: Vec<u32>,
     slots: Vec<Slot>,
     most_slots: usize,
-    /// Slots to be given to other blocks.
+    /// Slots that can be given to other blocks.
     replaceable: Vec<u32>,
     image: u64,
-    /// Blocks that the image needs, with those on the way to them.
+    /// Number of blocks that the image needs, including those on the path to them.
     needed: usize,
     missing: Vec<Missing>,
     stand_ins: usize,
@@ -89,26 +89,26 @@ pub(super) struct Streamed {
     wanted: Vec<u32>,
 }
 
-/// A block that is needed and not there.
+/// Needed block that is not in the pool.
 #[derive(Clone, Copy, Debug)]
 struct Missing {
     block: u32,
-    /// How far off is what it is needed for. [px]
+    /// Error of the block that it refines. [px]
     error_px: f32,
-    /// Not by this image, but soon.
+    /// Whether it is needed soon instead of by this image.
     soon: bool,
 }
 
-/// What a walk is for.
+/// Views of a walk.
 #[derive(Clone, Copy)]
 pub(super) struct Views<'a> {
-    /// The image.
+    /// View of the image.
     pub(super) image: &'a ObjectView,
-    /// A wider one, of what comes into view soon.
+    /// Wider view, for blocks that come into view soon.
     pub(super) soon: &'a ObjectView,
 }
 
-/// Returns a camera that looks at what the next images of another may show.
+/// Returns a camera with a margin around the image of `camera`: what its next images may show.
 pub(super) fn looking_beyond(camera: &Camera) -> Camera {
     let k = camera.intrinsics;
     let [beyond_x, beyond_y] =
@@ -123,21 +123,21 @@ pub(super) fn looking_beyond(camera: &Camera) -> Camera {
     Camera { intrinsics, ..*camera }
 }
 
-/// What the last image of a packed scene was made of.
+/// Statistics of the last image of a packed scene.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Streaming {
-    /// Blocks that stood in for finer ones that were not there yet.
+    /// Number of coarse blocks that were drawn because finer ones were not loaded yet.
     pub stand_ins: usize,
-    /// Blocks that were needed.
+    /// Number of needed blocks.
     pub needed: usize,
-    /// Blocks that fit into memory.
+    /// Maximum number of blocks in memory.
     pub most: usize,
-    /// How far off splats were allowed to be, where all was there: more than the scene was packed for where that would
-    /// not have fitted. [px]
+    /// Allowed error of splats in fully loaded areas. Greater than the value of the packing if the blocks of the
+    /// image would not fit otherwise. [px]
     pub max_error_px: f32,
 }
 
-/// Where a walk is: a tree, a level of it, a place in that.
+/// Position of a walk: tree, level, and index within the level.
 #[derive(Clone, Copy)]
 struct At {
     tree: usize,
@@ -146,7 +146,7 @@ struct At {
 }
 
 impl Streamed {
-    /// Starts to read a scene; returns also the pool, of at most so many bytes, as the part that is rendered.
+    /// Starts reading a scene. Returns also the pool, of at most `memory_bytes`, as the part that is rendered.
     pub(super) fn new(
         mut scene: PackedScene,
         memory_bytes: usize,
@@ -161,7 +161,7 @@ impl Streamed {
         }
         let mut pool = Part {
             levels: vec![0],
-            // Zeros: the system gives memory once it is written.
+            // Zeros: the system allocates memory only when it is written.
             geometry: vec![0.0; most_slots * GEOMETRY],
             sh: vec![0; most_slots * harmonics],
             coefficients,
@@ -199,7 +199,7 @@ impl Streamed {
         Ok((streamed, pool))
     }
 
-    /// Returns what the last image was made of.
+    /// Returns the statistics of the last image.
     pub(super) fn streaming(&self) -> Streaming {
         Streaming {
             stand_ins: self.stand_ins,
@@ -209,10 +209,10 @@ impl Streamed {
         }
     }
 
-    /// Puts what has arrived into the pool, and appends the blocks to draw.
+    /// Puts arrived blocks into the pool, and appends the blocks to draw.
     ///
     /// # Errors
-    /// Why the image cannot be made: the file cannot be read, or, where it is to be whole, it does not fit.
+    /// If the file cannot be read, or a complete image does not fit.
     pub(super) fn cull(
         &mut self,
         pool: &mut Part,
@@ -249,7 +249,8 @@ impl Streamed {
         Ok(())
     }
 
-    /// Allows more error where what the last image needed does not fit, and less again where it does by far.
+    /// Increases the allowed error if the blocks of the last image do not fit, and reduces it if they fit with a
+    /// margin.
     fn fit(&mut self) {
         if self.needed > self.most_slots {
             self.relief *= 1.1;
@@ -258,7 +259,7 @@ impl Streamed {
         }
     }
 
-    /// Gives what has arrived the slots that are free, then those needed longest ago; none that the last walk needed.
+    /// Puts arrived blocks into free slots, then into those needed least recently; never into those of the last walk.
     fn install(&mut self, pool: &mut Part) {
         self.arrived.retain(|arrived| self.slot_of[arrived.block as usize] == ABSENT);
         let free = self.most_slots - self.slots.len();
@@ -268,7 +269,7 @@ impl Streamed {
             let all = 0..slots.len() as u32;
             self.replaceable.extend(all.filter(|&slot| slots[slot as usize].needed < self.image));
             if more < self.replaceable.len() {
-                // Of those needed at the same time the finer one, which stands before what it is reached by.
+                // Among those needed at the same time, prefers the finer one, which is stored before its parent.
                 let oldest =
                     |&slot: &u32| (slots[slot as usize].needed, slots[slot as usize].block);
                 self.replaceable.select_nth_unstable_by_key(more, oldest);
@@ -276,7 +277,7 @@ impl Streamed {
             }
         }
         let harmonics = pool.sh_numbers() * BLOCK;
-        // Needed by the image that asked for it, or by one before.
+        // Needed by the image that requested it, or by an earlier one.
         let needed = self.image.saturating_sub(1);
         for Arrived { block, geometry, sh } in &self.arrived {
             let new = Slot { block: *block, needed };
@@ -296,11 +297,11 @@ impl Streamed {
         }
     }
 
-    /// Asks for what is missing, as much of it as there is room for: what the image needs in place of all that it does not,
-    /// what is needed soon in place of what neither this nor the last image looked at.
+    /// Requests missing blocks, as many as fit: those of this image can replace all blocks that it does not need,
+    /// those needed soon only blocks that neither this image nor the last one used.
     fn ask(&mut self) {
         let urgency = |a: &Missing, b: &Missing| {
-            // Of a tree's blocks the coarser one, which comes later, leads to the finer one.
+            // Coarser blocks of a tree first: they are stored later and lead to the finer ones.
             let error = b.error_px.total_cmp(&a.error_px);
             a.soon.cmp(&b.soon).then(error).then(b.block.cmp(&a.block))
         };
@@ -322,11 +323,11 @@ impl Streamed {
         self.reader.ask(&mut self.wanted);
     }
 
-    /// Appends the blocks to draw and notes those that are missing.
+    /// Appends the blocks to draw, and collects the missing ones.
     fn walk(&mut self, views: Views<'_>, visible: &mut Vec<Visible>) {
         self.missing.clear();
         self.stand_ins = 0;
-        // All the tops are there.
+        // All top blocks are in the pool.
         self.needed = self.trees.len();
         for tree in 0..self.trees.len() {
             let top = &self.blocks[self.trees[tree].top()];
@@ -338,7 +339,8 @@ impl Streamed {
         }
     }
 
-    /// Visits a block that is needed, now or `soon`, and what it stands for; draws where all on the way is there.
+    /// Visits a needed block and its children; `soon` if it is not needed yet. Draws it if all blocks on the path are
+    /// loaded.
     fn descend(
         &mut self,
         at: At,

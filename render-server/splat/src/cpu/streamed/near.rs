@@ -1,4 +1,4 @@
-//! Part of a packed scene as splats again, for what needs them one by one: obstacles, beams, maps.
+//! Reads part of a packed scene as splats, for obstacles, beams and maps.
 
 use glam::{Mat3, Quat, Vec3};
 use half::f16;
@@ -8,11 +8,12 @@ use super::file::{GEOMETRY, PackedError, PackedScene};
 use crate::Splats;
 
 impl PackedScene {
-    /// Reads the scene's own splats with their centres in a box, in the scene's frame [m]: what is near, for all that needs
-    /// splats one by one. Their colour is that of no direction (degree 0).
+    /// Reads the original splats with centres in a box, in the scene's frame [m]. Their colour is independent of
+    /// direction (degree 0).
     ///
     /// # Errors
-    /// [`PackedError::Crowded`], or the file cannot be read or is damaged.
+    /// [`PackedError::Crowded`] if the box contains more than `most` splats; other errors if the file cannot be read
+    /// or is damaged.
     pub fn splats_within(
         &mut self,
         min_m: Vec3,
@@ -26,7 +27,7 @@ impl PackedScene {
         for tree in self.trees.clone() {
             for block in tree.first..tree.first + tree.levels[1] {
                 let Block { center_m, half_m, .. } = self.blocks[block];
-                // Numbers that are not finite are not outside.
+                // Bounds that are not finite count as inside.
                 let is_outside =
                     (center_m + half_m).cmplt(min_m) | (center_m - half_m).cmpgt(max_m);
                 if is_outside.any() {
@@ -51,12 +52,12 @@ impl PackedScene {
     }
 }
 
-/// Returns three columns of a group's splat, from `first` on.
+/// Returns three columns of a splat in a group, starting at `first`.
 fn three(geometry: &[f32], first: usize, lane: usize) -> Vec3 {
     Vec3::from_array([0, 1, 2].map(|k| geometry[(first + k) * GROUP + lane]))
 }
 
-/// Appends the splat of a group's lane, unless its numbers are no splat's.
+/// Appends the splat of a group's lane; skips it if its values are invalid.
 fn push(splats: &mut Splats, at_m: Vec3, geometry: &[f32], sh: &[u16], lane: usize) {
     let axes = [0, 3, 6].map(|k| three(geometry, column::AXES + k, lane));
     let scale_m = Vec3::from_array(axes.map(Vec3::length));
@@ -73,8 +74,7 @@ fn push(splats: &mut Splats, at_m: Vec3, geometry: &[f32], sh: &[u16], lane: usi
     splats.sh.extend(colour);
 }
 
-/// Returns the turn of a splat whose axes, times its scales, are these. A scale of nothing leaves its axis where the others
-/// want it.
+/// Returns the rotation of a splat from its axes times scales. Axes with zero scale are completed from the others.
 fn rotation(axes: [Vec3; 3]) -> Quat {
     let mut order = [0, 1, 2];
     order.sort_by(|&a, &b| axes[b].length().total_cmp(&axes[a].length()));
@@ -86,7 +86,7 @@ fn rotation(axes: [Vec3; 3]) -> Quat {
         .unwrap_or_else(|| first.any_orthonormal_vector());
     let mut columns = [first; 3];
     columns[j] = second;
-    // Right-handed: 0 1 2 and what is turned from it.
+    // Right-handed: (0, 1, 2) and its cyclic permutations.
     columns[k] = if (i + 1) % 3 == j { first.cross(second) } else { second.cross(first) };
     let [x, y, z] = columns;
     Quat::from_mat3(&Mat3::from_cols(x, y, z)).normalize()

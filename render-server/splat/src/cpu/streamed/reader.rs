@@ -1,4 +1,4 @@
-//! A thread that reads asked-for blocks, so that an image does not wait for a disk.
+//! Thread that reads requested blocks, so that an image does not wait for the disk.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -7,10 +7,11 @@ use std::{io, thread};
 use super::file::{GEOMETRY, PackedScene};
 use crate::cpu::scene::BLOCK;
 
-/// Blocks read ahead at most: an image that takes them in copies some 14 MB, 40 with all harmonics, in 2 to 6 ms.
+/// Maximum number of blocks read ahead. Copying them costs an image 2 to 6 ms: about 14 MB, or 40 MB with all
+/// harmonics.
 const AHEAD: usize = 1024;
 
-/// A block as it was read.
+/// Block that was read.
 #[derive(Debug)]
 pub(super) struct Arrived {
     pub(super) block: u32,
@@ -20,13 +21,13 @@ pub(super) struct Arrived {
 
 #[derive(Debug, Default)]
 struct Shared {
-    /// The most urgent last.
+    /// Requested blocks, the most urgent last.
     wanted: Vec<u32>,
     reads: bool,
     arrived: Vec<Arrived>,
-    /// Buffers to read into again.
+    /// Buffers for reuse.
     spare: Vec<Arrived>,
-    /// Why no more is read.
+    /// Error that ended the reading.
     fault: Option<String>,
     ends: bool,
 }
@@ -54,7 +55,7 @@ impl Channel {
     }
 }
 
-/// The reading thread; it ends with this.
+/// Reader thread; stops when this value is dropped.
 #[derive(Debug)]
 pub(super) struct Reader {
     channel: Arc<Channel>,
@@ -71,17 +72,17 @@ impl Reader {
         Ok(Self { channel, thread: Some(thread) })
     }
 
-    /// Asks for blocks, the most urgent last, in place of what was asked for before. Leaves what `wanted` held then.
+    /// Replaces the requested blocks; the most urgent is last. `wanted` receives the previous list.
     pub(super) fn ask(&self, wanted: &mut Vec<u32>) {
         std::mem::swap(&mut self.channel.lock().wanted, wanted);
         self.channel.changed.notify_all();
     }
 
-    /// Exchanges what has arrived for buffers that are free again; where `waits`, once all that was asked for has, or as much
-    /// as is read ahead.
+    /// Exchanges arrived blocks for free buffers. With `waits`, waits until all requested blocks have arrived, or
+    /// until the maximum read ahead is reached.
     ///
     /// # Errors
-    /// Why nothing is read any more.
+    /// Error that ended the reading.
     pub(super) fn take(&self, arrived: &mut Vec<Arrived>, waits: bool) -> Result<(), String> {
         let mut shared = self.channel.lock();
         shared.spare.append(arrived);
@@ -102,13 +103,13 @@ impl Drop for Reader {
         self.channel.lock().ends = true;
         self.channel.changed.notify_all();
         if let Some(thread) = self.thread.take() {
-            // A panic there has been reported there.
+            // A panic there has already been reported.
             let _ = thread.join();
         }
     }
 }
 
-/// Reads what is wanted until told to end, or until it cannot.
+/// Reads requested blocks until the end is signalled or an error occurs.
 fn read_all(mut scene: PackedScene, channel: &Channel) {
     let harmonics = scene.coefficients * 3 * BLOCK;
     let mut shared = channel.lock();
@@ -118,7 +119,7 @@ fn read_all(mut scene: PackedScene, channel: &Channel) {
             shared = channel.wait(shared);
             continue;
         };
-        // Asked for again before it was taken.
+        // Requested again before it was taken.
         if shared.arrived.iter().any(|arrived| arrived.block == block) {
             channel.changed.notify_all();
             continue;

@@ -15,7 +15,7 @@ use crate::{
 
 const ERROR_PX: f32 = 1.0;
 
-/// A lawn of 8 m by 8 m, on `x_m` and on; 40,000 splats, of which every hundredth is 20 cm large.
+/// Returns a lawn of 8 m by 8 m that starts at `x_m`; 40,000 splats, every hundredth of them 20 cm large.
 fn lawn(x_m: f32, sh_degree: u8) -> Splats {
     let mut splats = Splats { sh_degree, ..Splats::default() };
     for i in 0..40_000u32 {
@@ -33,7 +33,7 @@ fn lawn(x_m: f32, sh_degree: u8) -> Splats {
     splats
 }
 
-/// Three lawns in a row; the middle one without harmonics.
+/// Returns three lawns in a row; the middle one without harmonics.
 fn lawns() -> [Splats; 3] {
     [lawn(0.0, 1), lawn(8.0, 0), lawn(16.0, 1)]
 }
@@ -49,7 +49,7 @@ fn packed(parts: &[Splats]) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// The lawns' file.
+/// Returns the packed file of the lawns.
 fn file() -> &'static [u8] {
     static FILE: OnceLock<Vec<u8>> = OnceLock::new();
     FILE.get_or_init(|| packed(&lawns()))
@@ -65,7 +65,7 @@ fn streamed(blocks: usize, loading: Loading) -> CpuRenderer {
     CpuRenderer::streamed(scene, &[], bytes, loading).unwrap()
 }
 
-/// 1.5 m above the lawns at `x_m`, looking along them, and down by some degrees.
+/// Returns a camera 1.5 m above the lawns at `x_m`, looking along them and down by some degrees.
 fn camera(x_m: f64, yaw_rad: f64) -> Camera {
     let ahead = DQuat::from_mat3(&glam::DMat3::from_cols(-DVec3::Y, -DVec3::Z, DVec3::X));
     let turn = DQuat::from_rotation_z(yaw_rad) * DQuat::from_rotation_y(0.3) * ahead;
@@ -84,11 +84,11 @@ fn render(
     Ok(image)
 }
 
-/// The parts in memory: one stands still, two are objects that stand where they are.
+/// Renderer of the parts in memory: one is static, two are objects that do not move.
 fn in_memory() -> CpuRenderer {
     let [still, rest @ ..] = lawns();
     let objects = rest.map(|mut splats| {
-        // As a pool holds them, of one degree.
+        // Converted to one degree, as in a pool.
         if splats.sh_degree == 0 {
             splats.sh = splats.sh.chunks(3).flat_map(|sh| [sh, &[0.0; 9]].concat()).collect();
             splats.sh_degree = 1;
@@ -103,7 +103,7 @@ fn flight() -> impl Iterator<Item = Camera> {
     (0..12).map(|i| camera(f64::from(i) * 2.0 - 3.0, 0.4 * f64::from(i)))
 }
 
-/// Blocks that the flight's most demanding image needs.
+/// Returns the maximum number of blocks that an image of the flight needs.
 fn enough() -> usize {
     let mut renderer = streamed(10_000, Loading::Whole);
     let needed = flight().map(|camera| {
@@ -114,7 +114,7 @@ fn enough() -> usize {
 }
 
 #[test]
-fn an_image_that_waits_is_that_of_the_scene_in_memory() {
+fn waiting_image_equals_that_of_the_scene_in_memory() {
     let mut expected = in_memory();
     let enough = enough();
     assert!(enough < open(file()).unwrap().blocks.len() * 3 / 4, "slots are given to others");
@@ -130,7 +130,7 @@ fn an_image_that_waits_is_that_of_the_scene_in_memory() {
 }
 
 #[test]
-fn an_image_that_does_not_wait_becomes_the_whole_one() {
+fn live_image_converges_to_the_complete_one() {
     let mut expected = in_memory();
     let mut renderer = streamed(enough() * 8 / 7 + 2, Loading::Live);
     for (i, camera) in flight().step_by(5).enumerate() {
@@ -139,7 +139,7 @@ fn an_image_that_does_not_wait_becomes_the_whole_one() {
         if i == 0 {
             let sum = |image: &RgbdImage| image.alpha.iter().sum::<f32>();
             let share = sum(&image) / sum(&whole);
-            assert!((0.3..1.5).contains(&share), "{share} is covered by what stands in");
+            assert!((0.3..1.5).contains(&share), "{share} is covered by stand-ins");
             assert!(renderer.streaming().unwrap().stand_ins > 0 && image != whole);
         }
         for _ in 0..2000 {
@@ -155,7 +155,7 @@ fn an_image_that_does_not_wait_becomes_the_whole_one() {
 }
 
 #[test]
-fn what_does_not_fit_is_coarser_or_refused() {
+fn renders_coarser_or_fails_if_memory_is_too_small() {
     let camera = camera(-1.0, 0.0);
     let mut whole = streamed(60, Loading::Whole);
     let refused = render(&mut whole, 0, camera).unwrap_err().to_string();
@@ -176,7 +176,7 @@ fn what_does_not_fit_is_coarser_or_refused() {
 }
 
 #[test]
-fn a_file_holds_what_it_was_packed_of() {
+fn packed_file_contains_the_packed_parts() {
     let scene = open(file()).unwrap();
     assert_eq!((scene.len(), scene.parts(), scene.max_error_px()), (120_000, 3, ERROR_PX));
     let empty = Splats { sh: Vec::new(), ..Splats::default() };
@@ -190,9 +190,9 @@ fn a_file_holds_what_it_was_packed_of() {
 }
 
 #[test]
-fn a_damaged_block_is_told_when_it_is_needed() {
+fn reports_a_damaged_block_when_it_is_needed() {
     let mut bytes = file().to_vec();
-    // Far from the tops, which are read first.
+    // Far from the top blocks, which are read first.
     bytes[48 + 5 * block_bytes(4) + 77] ^= 1;
     let mut renderer =
         CpuRenderer::streamed(open(bytes).unwrap(), &[], 1 << 30, Loading::Whole).unwrap();
@@ -203,7 +203,7 @@ fn a_damaged_block_is_told_when_it_is_needed() {
     }
 }
 
-/// Puts the checksums of a file right whose numbers were changed: of one block and of the tables.
+/// Recomputes the checksums of a modified file: of one block and of the tables.
 fn seal(bytes: &mut [u8], block: usize) {
     let sum = |pieces: &[&[u8]]| {
         let mut crc = Crc::new();
@@ -220,7 +220,7 @@ fn seal(bytes: &mut [u8], block: usize) {
 }
 
 #[test]
-fn what_is_near_is_read_splat_by_splat() {
+fn reads_original_splats_within_a_box() {
     let (min_m, max_m) = (Vec3::new(6.0, 2.0, -1.0), Vec3::new(9.0, 5.0, 1.0));
     let mut scene = open(file()).unwrap();
     let near = scene.splats_within(min_m, max_m, 40_000).unwrap();
@@ -232,7 +232,7 @@ fn what_is_near_is_read_splat_by_splat() {
                 continue;
             }
             found += 1;
-            // Two may stand at one place.
+            // Two splats may be at the same position.
             let same = near.means_m.iter().enumerate().filter(|(_, mean_m)| **mean_m == at_m);
             let is_same = |k: usize| {
                 let wide = |rotation: Quat, scale_m: Vec3| {
@@ -259,7 +259,7 @@ fn what_is_near_is_read_splat_by_splat() {
 }
 
 #[test]
-fn a_splat_without_extent_keeps_a_turn() {
+fn splat_without_extent_keeps_a_rotation() {
     let splats = Splats {
         means_m: vec![Vec3::ZERO; 3],
         scales_m: vec![Vec3::ZERO, Vec3::new(0.0, 0.1, 0.0), Vec3::new(0.1, 0.0, 0.2)],
@@ -299,11 +299,11 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
     #[test]
-    fn a_cut_or_damaged_file_is_refused(cut in 0usize..100_000, at in 0usize..100_000, bit in 0..8) {
+    fn rejects_a_truncated_or_damaged_file(cut in 0usize..100_000, at in 0usize..100_000, bit in 0..8) {
         let whole = file();
         let cut = whole.len() * cut / 100_000;
         prop_assert!(open(&whole[..cut]).is_err());
-        // Tables and header; blocks when they are read.
+        // Damages tables and header; blocks are checked when they are read.
         let tables = open(whole).unwrap().blocks.len() * 36 + 24 + 44;
         let at = at % tables;
         let at = if at < 44 { at } else { whole.len() - 1 - (at - 44) };
@@ -313,7 +313,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_read_or_refused(mut bytes in prop::collection::vec(any::<u8>(), 0..400), is_sealed: bool) {
+    fn reads_or_rejects_arbitrary_bytes(mut bytes in prop::collection::vec(any::<u8>(), 0..400), is_sealed: bool) {
         if is_sealed && bytes.len() > 48 {
             bytes[..8].copy_from_slice(MAGIC);
             bytes[8..12].copy_from_slice(&1u32.to_le_bytes());
@@ -323,7 +323,7 @@ proptest! {
     }
 
     #[test]
-    fn numbers_of_a_stranger_are_drawn_or_refused(
+    fn renders_or_rejects_untrusted_numbers(
         numbers in prop::collection::vec((0usize..4000, any::<u32>()), 1..40),
         rows in prop::collection::vec((0usize..8, any::<u32>()), 0..4),
         block in 0usize..100,
@@ -354,7 +354,7 @@ proptest! {
 }
 
 #[test]
-fn a_group_of_the_file_is_one_of_memory() {
-    // What `seal` and the format's description count on.
+fn file_layout_matches_memory_layout() {
+    // Assumptions of `seal` and of the format's description.
     assert_eq!((GEOMETRY, GROUP, block_bytes(4)), (3328, 16, 13_312 + 6_144));
 }

@@ -1,4 +1,4 @@
-//! The sort alone: lists of every length, short, as long as a run, and of several that are merged.
+//! Tests of the sort only: lists of every length, shorter than a run, of one run, and of several merged runs.
 
 use zerocopy::{FromBytes as _, IntoBytes as _};
 
@@ -7,19 +7,19 @@ use super::super::device::Adapter;
 use super::super::view::Tick;
 use super::*;
 
-/// Depth as bits, slot.
+/// Pair of depth as bits, and slot.
 type Pair = [u32; 2];
 
-/// Around a run's 1024 pairs, and merged once, twice, three and four times; 16 pairs are a thread's strip.
+/// Lengths around a run of 1024 pairs, and merged once to four times; a thread's strip has 16 pairs.
 const LENGTHS: [usize; 24] = [
     0, 1, 2, 3, 4, 5, 7, 8, 255, 256, 257, 1000, 1023, 1024, 1025, 1040, 2047, 2048, 2049, 3000,
     4097, 5000, 8193, 9000,
 ];
-/// Pairs between lists, which nobody may touch.
+/// Pairs between lists, which must not change.
 const GAP: usize = 3;
 const UNTOUCHED: Pair = [0xdead_beef; 2];
 
-/// Sorts lists on the device, one tile each; `None` without an adapter.
+/// Sorts lists on the device, one tile each; returns `None` without an adapter.
 fn sorted(lists: &[Vec<Pair>]) -> Option<Vec<Vec<Pair>>> {
     let Some(adapter) = Adapter::all().into_iter().next() else {
         println!("skipped: no graphics adapter; install mesa-vulkan-drivers and libvulkan1");
@@ -76,16 +76,16 @@ fn sorted(lists: &[Vec<Pair>]) -> Option<Vec<Vec<Pair>>> {
 }
 
 #[test]
-fn lists_of_every_length_are_sorted() {
+fn sorts_lists_of_every_length() {
     let mut state = 1u32;
     let mut random = move || {
-        // Knuth's multiplier, its upper bits.
+        // Knuth's multiplier; only the upper bits are used.
         state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         state >> 8
     };
     let mut lists: Vec<Vec<Pair>> = Vec::new();
     for length in LENGTHS {
-        // Slots are a list's own, each once: no two pairs are equal.
+        // Slots are unique within a list, so no two pairs are equal.
         let mut slots: Vec<u32> = (0..length as u32).collect();
         for i in (1..length).rev() {
             slots.swap(i, random() as usize % (i + 1));

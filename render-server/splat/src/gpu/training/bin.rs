@@ -1,8 +1,8 @@
-//! Pass 4: which splats touch which tile, each list nearest first.
+//! Pass 4: lists the splats that touch each tile, from near to far.
 //!
-//! Budget: 36 bytes read twice per visible splat in random order, 8 written per pair, then two
-//! digits of a sort (three above 65 k tiles) at 20 bytes per pair. Per splat one thread walks its
-//! rows of tiles: a splat as large as the image takes longest, some 1 us per hundred tiles.
+//! Budget: 36 bytes read twice per visible splat in random order, 8 written per pair, then two digits of a sort
+//! (three above 65 k tiles) at 20 bytes per pair. One thread iterates over the rows of tiles of a splat: a splat as
+//! large as the image takes longest, about 1 us per hundred tiles.
 
 use super::super::device::{Device, Groups, Kernel};
 use super::sort::{Count, Digit, Pairs, Sort};
@@ -20,7 +20,7 @@ const SOURCE: &str = concat!(
 pub(super) const PAIRS: Count = Count { size: 4, groups: 12 };
 pub(super) const BIN: u32 = 8;
 
-/// The pass.
+/// Pass with its kernels.
 #[derive(Debug)]
 pub(super) struct Bin {
     count_visible: Kernel,
@@ -30,7 +30,7 @@ pub(super) struct Bin {
     bound: Kernel,
 }
 
-/// Its buffers, bound.
+/// Bindings of the buffers.
 #[derive(Debug)]
 pub(super) struct BinBindings {
     count_visible: wgpu::BindGroup,
@@ -53,8 +53,8 @@ impl Bin {
         }
     }
 
-    /// Binds; `order` is what the sort by depth leaves. With a `permutation` the sort by tile moves the
-    /// numbers of pairs there, and leaves their slots as they were emitted, in `slots[0]`.
+    /// Binds the buffers; `order` is the result of the sort by depth. With a `permutation`, the sort by tile writes
+    /// the indices of pairs there, and leaves their slots in `slots[0]` in the order in which they were emitted.
     pub(super) fn bind(
         &self,
         device: &Device,
@@ -99,7 +99,7 @@ impl Bin {
         }
     }
 
-    /// Counts what the first digit of the sort by depth has found visible.
+    /// Counts the visible splats, from the counts of the first digit of the sort by depth.
     pub(super) fn count_visible(&self, pass: &mut wgpu::ComputePass<'_>, bindings: &BinBindings) {
         self.count_visible.run(pass, &bindings.count_visible, Groups::Known(1, 1));
     }

@@ -1,32 +1,32 @@
-// Pass 4: which splats touch which tile.
+// Pass 4: lists the splats that touch each tile.
 //
-// In order of depth, each splat's tiles are counted, the counts become places, and the pairs
-// (tile, slot) are written there: ordered by depth. A stable sort by tile leaves each tile's list
-// nearest first; `bound` notes where each list starts and ends.
+// In order of depth, the tiles of each splat are counted, the counts are converted to positions, and the pairs (tile,
+// slot) are written there: ordered by depth. A stable sort by tile then gives the list of each tile from near to far;
+// `bound` stores start and end of each list.
 
 @group(0) @binding(0) var<uniform> tick: Tick;
 @group(0) @binding(1) var<storage, read> views: array<View>;
 @group(0) @binding(2) var<storage, read_write> sizes: array<u32>;
 @group(0) @binding(3) var<storage, read_write> dispatches: array<u32>;
-// Slots, nearest first.
+// Slots, from near to far.
 @group(0) @binding(4) var<storage, read> order: array<u32>;
 @group(0) @binding(5) var<storage, read> shapes: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read> extents: array<vec4<f32>>;
-// Per splat in order of depth; then per workgroup of `count_tiles`, later its first pair.
+// Counts per splat in order of depth; then per workgroup of `count_tiles`, later its first pair.
 @group(0) @binding(7) var<storage, read_write> counts: array<u32>;
 @group(0) @binding(8) var<storage, read_write> tiles: array<u32>;
 @group(0) @binding(9) var<storage, read_write> slots: array<u32>;
 @group(0) @binding(10) var<storage, read> digits: array<u32>;
 @group(0) @binding(11) var<storage, read> sorted_tiles: array<u32>;
-// Per tile: first pair, one past the last.
+// First pair and end of each tile.
 @group(0) @binding(12) var<storage, read_write> lists: array<vec2<u32>>;
 
-/// A splat's ellipse, and the rows of tiles it reaches.
+/// Ellipse of a splat, and the rows of tiles that it reaches.
 struct Rows {
     ellipse: Ellipse,
     width: f32,
     top: u32,
-    /// One past the last.
+    /// End of the rows.
     bottom: u32,
     tiles_x: u32,
     first_tile: u32,
@@ -50,7 +50,7 @@ fn rows_of(slot: u32) -> Rows {
     return Rows(ellipse, f32(size.x), top, bottom, size.z, size.w);
 }
 
-/// Tiles of a row that the ellipse reaches: first, and one past the last.
+/// Tiles of a row that the ellipse reaches: first and end.
 fn span(r: Rows, row: u32) -> vec2<u32> {
     let top = f32(row * TILE) + 0.5;
     let edges = band(r.ellipse, top, top + f32(TILE - 1u));
@@ -61,7 +61,7 @@ fn span(r: Rows, row: u32) -> vec2<u32> {
     return vec2(columns.x / TILE, (columns.y - 1u) / TILE + 1u);
 }
 
-// One workgroup, after the first digit of the sort by depth: how many splats are visible.
+// One workgroup, after the first digit of the sort by depth: counts the visible splats.
 @compute @workgroup_size(256)
 fn count_visible(@builtin(local_invocation_index) thread: u32) {
     let groups = (sizes[SLOTS] + SORT_GROUP - 1u) / SORT_GROUP;
@@ -100,7 +100,7 @@ fn count_tiles(
     }
 }
 
-// One workgroup: turns numbers of pairs into first pairs.
+// One workgroup: converts numbers of pairs to first pairs.
 @compute @workgroup_size(256)
 fn place_pairs(@builtin(local_invocation_index) thread: u32) {
     let visible = sizes[VISIBLE];
@@ -116,7 +116,7 @@ fn place_pairs(@builtin(local_invocation_index) thread: u32) {
         if i < groups {
             counts[visible + i] = carry + before;
         }
-        // Saturates: more pairs than 2^32 are more than there is room for, not fewer.
+        // Saturates: an overflow of 2^32 pairs must not appear as fewer pairs.
         carry = select(carry + scan_total, 0xffffffffu, carry + scan_total < carry);
         workgroupBarrier();
     }
@@ -143,7 +143,7 @@ fn emit(
     }
     let before = scan(thread, count);
     if i >= visible || sizes[PAIRS_WANTED] > tick.pairs {
-        // With no room for all of them there will be another try.
+        // Too little room for all pairs: the photo is rendered again.
         return;
     }
     var place = counts[visible + group.x] + before;
@@ -153,7 +153,7 @@ fn emit(
     for (var row = r.top; row < r.bottom; row++) {
         let columns = span(r, row);
         for (var column = columns.x; column < columns.y; column++) {
-            // Compilers may round this kernel and `count_tiles` differently: neither more ...
+            // Compilers may round this kernel and `count_tiles` differently: writes not more ...
             if place < end {
                 tiles[place] = r.first_tile + row * r.tiles_x + column;
                 slots[place] = slot;
@@ -161,7 +161,7 @@ fn emit(
             }
         }
     }
-    // ... nor fewer than were counted.
+    // ... and not fewer pairs than counted.
     while place < end {
         tiles[place] = tick.tiles;
         slots[place] = slot;

@@ -1,11 +1,12 @@
-//! Passes 3 and 4 of training: each tile's pixels from its list, and what a loss feels at them back to it.
+//! Passes 3 and 4 of training: renders the pixels of each tile from its list, and propagates the derivative of a loss
+//! by the pixels back to the list.
 //!
-//! Back, a splat's sums over the 256 pixels of a tile are added up in workgroup memory, in one order, and
-//! written to the pair's own place: no atomics, and the same bits in every run.
+//! Backward, the sums of a splat over the 256 pixels of a tile are added in workgroup memory in a fixed order, and
+//! written to the pair's own place: no atomics, and bit-identical results in every run.
 //!
-//! Budget: 48 bytes read per pair that is not behind opaque ones, 24 written per pixel; back 52 read per pixel
-//! and 48 written per pair. Bound by arithmetic: some 25 operations per pair and pixel forward, 70 back, and 64
-//! additions by each of 44 threads for four pairs.
+//! Budget: 48 bytes read per pair that is not hidden by opaque ones, 24 written per pixel; backward 52 read per pixel
+//! and 48 written per pair. Limited by arithmetic: about 25 operations per pair and pixel forward, 70 backward, and
+//! 64 additions by each of 44 threads for four pairs.
 
 use super::super::device::{Device, Groups, Kernel};
 use super::buffers::TrainingBuffers;
@@ -13,14 +14,14 @@ use super::buffers::TrainingBuffers;
 const SOURCE: &str =
     concat!(include_str!("../common.wgsl"), include_str!("photo.wgsl"), include_str!("blend.wgsl"));
 
-/// The passes.
+/// Passes with their kernels.
 #[derive(Debug)]
 pub(super) struct Blend {
     forward: Kernel,
     back: Kernel,
 }
 
-/// Their buffers, bound.
+/// Bindings of the buffers.
 #[derive(Debug)]
 pub(super) struct BlendBindings {
     forward: wgpu::BindGroup,

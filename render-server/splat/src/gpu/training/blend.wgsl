@@ -1,7 +1,7 @@
-// Pass 3 of training: the channels of each tile's pixels, from near to far; and pass 4, what a loss feels at
-// the pixels back to the pairs of the tile's list. One workgroup per tile; each thread has four pixels of a
-// row. Planes are laid out as `Planes` of `vizflyt-twin` has them: band of tiles by band, channel by
-// channel, row by row.
+// Pass 3 of training: renders the channels of each tile's pixels from near to far. Pass 4: propagates the derivative
+// of a loss by the pixels back to the pairs of the tile's list. One workgroup per tile; each thread processes four
+// pixels of a row. The layout of planes is that of `Planes` of `vizflyt-twin`: by band of tiles, then channel, then
+// row.
 
 @group(0) @binding(1) var<storage, read> shapes: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> extents: array<vec4<f32>>;
@@ -10,16 +10,16 @@
 @group(0) @binding(5) var<storage, read> lists: array<vec2<u32>>;
 // Red, green, blue, sum w z, sum w z^2, transmittance.
 @group(0) @binding(6) var<storage, read_write> image: array<f32>;
-// The derivative of the loss by each of these, and how wrong a pixel is.
+// Derivative of the loss by each of these, and the error of a pixel.
 @group(0) @binding(7) var<storage, read> by: array<f32>;
-// Twelve numbers per pair, the last without meaning.
+// Twelve values per pair, the last one unused.
 @group(0) @binding(8) var<storage, read_write> pair_sums: array<f32>;
 
 const ALPHA_MAX = 0.99;
 const TRANSMITTANCE_MIN = 1e-4;
 const CHANNELS = 6u;
 const BY_CHANNELS = 7u;
-/// Workgroups along x at most.
+/// Maximum number of workgroups along x.
 const GRID = 32768u;
 const THREADS = 64u;
 const BATCH = 64u;
@@ -27,18 +27,18 @@ const BATCH = 64u;
 var<workgroup> batch_shapes: array<vec4<f32>, BATCH>;
 var<workgroup> batch_extents: array<vec4<f32>, BATCH>;
 var<workgroup> batch_colours: array<vec4<f32>, BATCH>;
-/// Threads all of whose pixels have ended.
+/// Number of threads with all pixels ended.
 var<workgroup> ended: atomic<u32>;
 var<workgroup> ended_before: u32;
 
-/// A thread's four pixels.
+/// Four pixels of a thread.
 struct Quad {
-    /// The first number of a plane's first channel.
+    /// Index of the first value in the first channel of a plane.
     place: u32,
-    /// Centres. [px]
+    /// Pixel centres. [px]
     x: vec4<f32>,
     y: f32,
-    /// Which of them the image has.
+    /// Pixels that are within the image.
     exists: vec4<bool>,
 }
 
@@ -54,7 +54,7 @@ fn quad(tile: u32, thread: u32, channels: u32) -> Quad {
     return Quad(place, vec4<f32>(across) + 0.5, f32(pixel.y) + 0.5, exists);
 }
 
-/// Numbers from one channel of a band to the next.
+/// Returns the number of values from one channel of a band to the next.
 fn plane() -> u32 {
     return TILE * photo.size.z * TILE;
 }
@@ -147,11 +147,11 @@ fn blend(
 
 const SUMS = 11u;
 const PAIR_STRIDE = 12u;
-/// Splats whose sums a workgroup adds up at once: as many as 16 KiB hold.
+/// Number of splats whose sums a workgroup adds at once: the maximum for 16 KiB.
 const TOGETHER = 4u;
-/// One more than threads, so that sums lie in different banks.
+/// One more than the number of threads, so that sums are in different banks.
 const PARTIAL_STRIDE = 65u;
-/// A thread's share of each sum.
+/// Contributions of each thread to each sum.
 var<workgroup> partial: array<f32, 2860>;
 
 fn by_channel(q: Quad, channel: u32) -> vec4<f32> {
@@ -190,7 +190,7 @@ fn blend_back(
     let second_z = by_channel(q, 4u);
     let through = by_channel(q, 5u);
     let error = by_channel(q, 6u);
-    // What is still to come behind, by subtraction from all there is.
+    // Sum of the contributions behind the current splat: computed by subtraction from the total.
     var rest = image_channel(of_image, 0u) * red + image_channel(of_image, 1u) * green
         + image_channel(of_image, 2u) * blue + image_channel(of_image, 3u) * first_z
         + image_channel(of_image, 4u) * second_z + image_channel(of_image, 5u) * through;
@@ -211,7 +211,7 @@ fn blend_back(
         }
         let count = min(BATCH, list.y - first);
         if workgroupUniformLoad(&ended_before) == THREADS {
-            // Nobody sees these: what the last step left there must not count.
+            // These are hidden: the place must not keep the sums of an earlier step.
             for (var i = thread; i < count * PAIR_STRIDE; i += THREADS) {
                 pair_sums[first * PAIR_STRIDE + i] = 0.0;
             }
@@ -241,13 +241,13 @@ fn blend_back(
                 let after = transmittance - alpha * transmittance;
                 goes_on = goes_on & (after > vec4(TRANSMITTANCE_MIN));
                 let weight = select(vec4(0.0), alpha * transmittance, goes_on);
-                // What one unit of weight is worth here.
+                // Derivative of the loss by the weight.
                 let z = colour.w;
                 let worth = red * colour.x + green * colour.y + blue * colour.z
                     + (second_z * z + first_z) * z;
                 rest -= weight * worth;
                 let by_alpha = transmittance * worth - rest / (vec4(1.0) - alpha);
-                // Cut off at its greatest, alpha does not change with the level.
+                // Where alpha is clamped to its maximum, it does not change with the level.
                 let free = goes_on & (full < vec4(ALPHA_MAX));
                 let g = select(vec4(0.0), by_alpha * alpha, free);
                 keep(splat, 0u, thread, g);
@@ -263,7 +263,7 @@ fn blend_back(
                 keep(splat, 10u, thread, weight * error);
                 transmittance = select(transmittance, after, goes_on);
                 if !any(goes_on) {
-                    // Hit with some pixel going on until now: this happens once.
+                    // Reached only while some pixel has not ended, so this happens once per thread.
                     atomicAdd(&ended, 1u);
                 }
             }

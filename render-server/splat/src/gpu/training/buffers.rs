@@ -1,6 +1,6 @@
-//! What the passes of training leave for each other, beside the renderer's own buffers.
+//! Buffers between the passes of training, in addition to [`Buffers`].
 //!
-//! Memory: 132 bytes per row besides its numbers, which are there twice, 76 per pair, 52 per pixel.
+//! Memory: 132 bytes per row plus twice its values, 76 per pair, 52 per pixel.
 
 use super::super::buffers::grown;
 use super::super::device::Device;
@@ -9,36 +9,36 @@ use super::tiling::{Buffers, Capacity};
 use super::{BY_CHANNELS, CHANNELS, RowGradient};
 use crate::blocks::BLOCK;
 
-/// Numbers that a pair's sums take.
+/// Number of words of a pair's sums.
 const PAIR_WORDS: u64 = 12;
 
-/// How much there must be room for, beside the shared [`Capacity`].
+/// Capacity of the buffers, in addition to the shared [`Capacity`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct TrainingCapacity {
     pub(super) shared: Capacity,
-    /// Numbers of all rows.
+    /// Number of values of all rows.
     pub(super) row_words: u64,
-    /// Numbers of a channel.
+    /// Number of values of a channel.
     pub(super) plane: u64,
 }
 
 impl TrainingCapacity {
-    /// Returns the greatest that a device can give.
+    /// Returns the maximum capacity of a device.
     pub(super) fn limit(binding_bytes: u64) -> Self {
-        // So that a pair's sums, the largest there is per pair, fit too.
+        // Reduced so that the sums of pairs, the largest buffer per pair, also fit.
         let shared = Capacity::limit(binding_bytes / PAIR_WORDS);
         let channels = BY_CHANNELS as u64;
         Self { shared, row_words: binding_bytes / 4, plane: binding_bytes / (4 * channels) }
     }
 
-    /// Whether it holds another.
+    /// Returns whether it is at least as large as another capacity.
     pub(super) fn holds(&self, other: &Self) -> bool {
         self.shared.holds(&other.shared)
             && self.row_words >= other.row_words
             && self.plane >= other.plane
     }
 
-    /// Whether a device can give it.
+    /// Returns whether it is within the device's limit.
     pub(super) fn is_within(&self, limit: &Self) -> bool {
         self.shared.is_within(&limit.shared)
             && self.shared.tile_digits <= limit.shared.tile_digits
@@ -46,7 +46,7 @@ impl TrainingCapacity {
             && self.plane <= limit.plane
     }
 
-    /// Returns room for another too, a quarter more than what has to grow, within a limit.
+    /// Returns a capacity that also holds `other`; sizes that must grow get a quarter more, within the limit.
     pub(super) fn grown_to(&self, other: &Self, limit: &Self) -> Self {
         Self {
             shared: self.shared.grown_to(&other.shared, &limit.shared),
@@ -56,18 +56,18 @@ impl TrainingCapacity {
     }
 }
 
-/// The buffers; named as in the shaders.
+/// Buffers, named as in the shaders.
 #[derive(Debug)]
 pub(super) struct TrainingBuffers {
     pub(super) capacity: TrainingCapacity,
     pub(super) shared: Buffers,
     pub(super) photo: wgpu::Buffer,
     pub(super) rows: wgpu::Buffer,
-    /// Rows that changed.
+    /// Changed rows.
     pub(super) changes: wgpu::Buffer,
     pub(super) image: wgpu::Buffer,
     pub(super) by: wgpu::Buffer,
-    /// Numbers of pairs, before and after each digit of the sort by tile.
+    /// Indices of pairs, before and after each digit of the sort by tile.
     pub(super) permutation: [wgpu::Buffer; 2],
     pub(super) places: wgpu::Buffer,
     pub(super) pair_sums: wgpu::Buffer,

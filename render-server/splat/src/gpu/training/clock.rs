@@ -1,4 +1,4 @@
-//! How long the parts of training take: on the device by its own clock, where the adapter has one.
+//! Time of the passes of training, measured on the device if the adapter has timestamps.
 
 use std::fmt;
 use std::ops::Range;
@@ -9,35 +9,35 @@ use serde::Serialize;
 use super::super::device::Device;
 use super::super::read::Staging;
 
-/// Where the time of photos went, all together. Those of the device are 0 where it has no clock. [ms]
+/// Accumulated time of the passes of all photos. Times of the device are 0 if it has no timestamps. [ms]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct TrainingTimes {
-    /// The host writes rows.
+    /// Host: writing rows.
     pub rows: f64,
-    /// The device puts changed ones in their places.
+    /// Device: copying changed rows to their places.
     pub scatter: f64,
-    /// It takes rows onto the image plane.
+    /// Device: projecting rows onto the image plane.
     pub project: f64,
-    /// It sorts them by depth.
+    /// Device: sorting by depth.
     pub sort: f64,
-    /// It gives each tile its list.
+    /// Device: building the list of each tile.
     pub bin: f64,
-    /// It renders the tiles.
+    /// Device: rendering the tiles.
     pub blend: f64,
-    /// The host reads the image.
+    /// Host: reading the image.
     pub image: f64,
-    /// The host writes the derivative by the image.
+    /// Host: writing the derivative by the image.
     pub derivative: f64,
-    /// The device takes it to the pairs of tiles and rows.
+    /// Device: propagating the derivative to the pairs of tiles and rows.
     pub blend_back: f64,
-    /// It takes that to the rows.
+    /// Device: propagating the derivative to the rows.
     pub unproject: f64,
-    /// The host reads the gradients.
+    /// Host: reading the gradients.
     pub gradients: f64,
 }
 
 impl TrainingTimes {
-    /// Returns a share of all.
+    /// Returns all times multiplied by `share`.
     #[must_use]
     pub fn times(self, share: f64) -> Self {
         Self {
@@ -69,28 +69,28 @@ impl fmt::Display for TrainingTimes {
     }
 }
 
-/// The device's parts of a forward pass, in order.
+/// Passes of the device in a forward step, in order.
 pub(super) const FORWARD: Range<usize> = 0..5;
-/// Those of a backward pass.
+/// Passes of the device in a backward step.
 pub(super) const BACKWARD: Range<usize> = 5..7;
 const PASSES: usize = 7;
 
-/// Bytes of the stamps of so many passes.
+/// Returns the size of the timestamps of `passes`. [byte]
 pub(super) fn stamp_bytes(passes: &Range<usize>) -> u64 {
     16 * passes.len() as u64
 }
 
-/// The device's clock.
+/// Timestamps of the device.
 #[derive(Debug)]
 pub(super) struct Clock {
     queries: wgpu::QuerySet,
     resolved: wgpu::Buffer,
-    /// [ms]
+    /// Period of a timestamp's tick. [ms]
     period: f64,
 }
 
 impl Clock {
-    /// Is `None` where the adapter has none.
+    /// Returns `None` if the adapter has no timestamps.
     pub(super) fn new(device: &Device) -> Option<Self> {
         device.has_timestamps.then(|| Self {
             queries: device.device.create_query_set(&wgpu::QuerySetDescriptor {
@@ -107,7 +107,7 @@ impl Clock {
         })
     }
 
-    /// Returns the two stamps of a pass.
+    /// Returns the two timestamps of a pass.
     pub(super) fn of_pass(&self, pass: usize) -> wgpu::ComputePassTimestampWrites<'_> {
         wgpu::ComputePassTimestampWrites {
             query_set: &self.queries,
@@ -116,7 +116,7 @@ impl Clock {
         }
     }
 
-    /// Adds the copy of the stamps of passes that have run.
+    /// Adds a copy of the timestamps of finished passes.
     pub(super) fn copy(
         &self,
         encoder: &mut wgpu::CommandEncoder,
@@ -129,20 +129,20 @@ impl Clock {
         staging.copy_from(encoder, &self.resolved, at, stamp_bytes(passes));
     }
 
-    /// Returns how long each of `N` passes took, from their stamps. [ms]
+    /// Returns the time of each of `N` passes from their timestamps. [ms]
     pub(super) fn times<const N: usize>(&self, stamps: &[u8]) -> [f64; N] {
         let stamp = |i: usize| {
             let bytes = &stamps[8 * i..8 * i + 8];
             bytes.iter().rev().fold(0u64, |sum, &byte| sum << 8 | u64::from(byte))
         };
-        // Clocks may be reset in between.
+        // The clock may be reset in between.
         std::array::from_fn(|pass| {
             stamp(2 * pass + 1).saturating_sub(stamp(2 * pass)) as f64 * self.period
         })
     }
 }
 
-/// Adds what has passed since an instant. [ms]
+/// Adds the time since an instant. [ms]
 pub(super) fn add(to: &mut f64, since: Instant) {
     *to += since.elapsed().as_secs_f64() * 1e3;
 }

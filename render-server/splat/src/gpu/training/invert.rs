@@ -1,4 +1,4 @@
-//! After pass 2 of training: lists of slots, and where each splat's pairs stand in them.
+//! After pass 2 of training: writes the lists of slots, and the position of each splat's pairs in them.
 //!
 //! Budget: 20 bytes moved per pair, half of them in random order.
 
@@ -12,7 +12,7 @@ const SOURCE: &str = concat!(
     include_str!("invert.wgsl")
 );
 
-/// The pass.
+/// Pass with its kernel.
 #[derive(Debug)]
 pub(super) struct Invert {
     kernel: Kernel,

@@ -1,6 +1,6 @@
-// After pass 2 of training: the sort by tile has moved the numbers of pairs, not their slots. From those
-// numbers come the lists of slots, and where each pair stands in them: a splat's pairs, which `emit` wrote
-// one after the other, find what the tiles summed up for it.
+// After pass 2 of training: the sort by tile has moved the indices of pairs, not their slots. This pass derives the
+// lists of slots from these indices, and the position of each pair in the lists, so that a splat's pairs, which
+// `emit` wrote one after the other, find the sums of the tiles.
 
 @group(0) @binding(0) var<storage, read> sizes: array<u32>;
 @group(0) @binding(1) var<storage, read> slots: array<u32>;
@@ -10,7 +10,7 @@
 @group(0) @binding(5) var<storage, read_write> places: array<u32>;
 @group(0) @binding(6) var<uniform> tick: Tick;
 
-/// The place of a pair that is in no tile's list.
+/// Position of a pair that is not in the list of any tile.
 const NOWHERE = 0xffffffffu;
 
 @compute @workgroup_size(256)

@@ -1,21 +1,22 @@
-//! Training on a graphics card: rows of parameters -> the channels of a photo, and the derivative of a loss by
-//! them back to the rows.
+//! Training on a graphics card: renders rows of parameters to the channels of a photo, and propagates the derivative
+//! of a loss by these channels back to the rows.
 //!
-//! Data flow, the files in run order: `scatter` brings rows up to date; `photo` turns a camera into numbers;
-//! `project` brings rows onto its image plane; the renderer's own `sort` and `bin` give each tile its list; `invert` notes where each pair stands in
-//! the lists; `blend` renders the tiles. The caller compares image and photo. Then `blend` takes what the loss
-//! feels at the pixels to the pairs, and `unproject` adds each row's pairs up and takes them to its
-//! parameters. `vizflyt-twin` has the same passes for the processor, and what they are held against.
+//! Data flow, with the files in run order: `scatter` updates the rows on the device. `photo` converts a camera to
+//! numbers. `project` projects the rows onto its image plane; `sort` and `bin` build the list of each tile. `invert`
+//! stores the position of each pair in the lists. `blend` renders the tiles. The caller compares the image with the
+//! photo. Then `blend` propagates the derivative from the pixels to the pairs, and `unproject` sums the pairs of each
+//! row and propagates them to its parameters. `vizflyt-twin` has the same passes for the processor, with which these
+//! are compared.
 //!
-//! Every sum has one order and a place of its own (`blend.rs`): the same rows, photo and derivative give the
-//! same gradients, bit for bit, in every run on one device.
+//! Every sum has a fixed order and its own memory (`blend.rs`): on one device, the same rows, photo and derivative
+//! give bit-identical gradients in every run.
 //!
-//! The rows stay on the device: what changed since the last photo goes up alone (`scatter.rs`), and the host's are
-//! the truth. A device that has others, or new buffers, takes them all.
+//! The rows stay on the device: only changes since the last photo are uploaded (`scatter.rs`), and the rows of the
+//! host are authoritative. All rows are uploaded if their number differs or the buffers are new.
 //!
-//! Budget: `scatter`, `project`, `blend` and `unproject` say theirs, and [`TrainingTimes`] what it came to. The bus
-//! carries changed rows up, the image down, its derivative up and 64 bytes per visible row down: where 60 k rows of
-//! degree 2 are seen at 320x240, 9.4 + 1.8 + 2.2 + 3.8 MB.
+//! Budget: see `scatter`, `project`, `blend` and `unproject`; [`TrainingTimes`] contains the measured times. The bus
+//! carries changed rows up, the image down, its derivative up, and 64 bytes per visible row down: 9.4 + 1.8 + 2.2 +
+//! 3.8 MB for 60 k visible rows of degree 2 at 320x240.
 
 mod bin;
 mod blend;
@@ -53,21 +54,21 @@ use scatter::Scatter;
 use sort::{Count, Pairs, Sort};
 use upload::{PART, Upload};
 
-/// Channels of an image: red, green, blue, `sum w z`, `sum w z^2`, transmittance. Numbers lie band of tiles by
-/// band, channel by channel, row by row, padded to whole tiles of 16 pixels.
+/// Number of channels of an image: red, green, blue, `sum w z`, `sum w z^2`, transmittance. Values are stored by band
+/// of tiles, then channel, then row, padded to whole tiles of 16 pixels.
 pub const CHANNELS: usize = 6;
-/// Channels of a derivative: by each of these, and how wrong a pixel is.
+/// Number of channels of a derivative: by each channel of the image, and the error of each pixel.
 pub const BY_CHANNELS: usize = 7;
 
-/// The derivative of a loss by a row that a photo shows.
+/// Derivative of a loss by a row that is visible in a photo.
 #[derive(Clone, Copy, Debug, Default, PartialEq, FromBytes, Immutable, KnownLayout)]
 #[repr(C)]
 pub struct RowGradient {
-    /// By mean, 3; logarithms of the scales, 3; rotation, 4; logit of the opacity.
+    /// By mean (3), logarithms of the scales (3), rotation (4), logit of the opacity (1).
     pub geometry: [f32; 11],
-    /// The error seen through it.
+    /// Error of the pixels through this row.
     pub error: f32,
-    /// By the colour; times a basis function, by a harmonic.
+    /// By the colour; times a basis function, it is the derivative by a harmonic.
     pub rgb: [f32; 3],
     row: f32,
 }
@@ -75,25 +76,25 @@ pub struct RowGradient {
 const _: () = assert!(size_of::<RowGradient>() == 64);
 
 impl RowGradient {
-    /// Returns its row.
+    /// Returns the row's index.
     pub fn row(&self) -> usize {
-        // Rows are fewer than 2^24: exact.
+        // Rows are fewer than 2^24, so f32 is exact.
         self.row as usize
     }
 }
 
-/// Digits of a depth: 32 bits.
+/// Bits of a depth.
 const DEPTH_BITS: u32 = 32;
 /// Words of `sizes` and `dispatches`, as in `sizes.wgsl`.
 const SLOTS: Count = Count { size: 1, groups: 0 };
 const VISIBLE: Count = Count { size: 2, groups: 4 };
 
-/// Where the stamps lie in a staging buffer, behind what the device counted; and the image behind them.
+/// Offset of the timestamps in a staging buffer, after the device's counts; the image follows.
 const STAMPS_AT: usize = super::buffers::SIZES_BYTES as usize;
 const IMAGE_AT: usize = 128;
 const _: () = assert!(STAMPS_AT + 16 * FORWARD.end <= IMAGE_AT);
 
-/// Renders rows, and takes derivatives back to them, with a graphics card.
+/// Renders rows and propagates derivatives back to them, on a graphics card.
 #[derive(Debug)]
 pub struct TrainingRenderer {
     name: String,
@@ -106,13 +107,13 @@ pub struct TrainingRenderer {
     upload: Option<Upload>,
     clock: Option<Clock>,
     times: TrainingTimes,
-    /// Of the photo rendered last: tiles, rows that it shows, pairs.
+    /// Of the last rendered photo: tiles, visible rows, pairs.
     tiles: u32,
     visible: u32,
     pairs: u32,
 }
 
-/// The kernels.
+/// Compiled kernels.
 #[derive(Debug)]
 struct Passes {
     scatter: Scatter,
@@ -124,11 +125,11 @@ struct Passes {
     unproject: unproject::Unproject,
 }
 
-/// Buffers, and the kernels' bindings to them.
+/// Buffers and the kernels' bindings to them.
 #[derive(Debug)]
 struct Bound {
     buffers: TrainingBuffers,
-    /// How many numbers of rows it has, and of each row: as they were for the last photo.
+    /// Number of row values and values per row on the device, from the last photo; `None` if the buffers are new.
     rows: Option<(usize, usize)>,
     scatter: wgpu::BindGroup,
     project: wgpu::BindGroup,
@@ -179,29 +180,29 @@ impl TrainingRenderer {
         &self.name
     }
 
-    /// Returns the number of (tile, row) pairs of the photo rendered last.
+    /// Returns the number of (tile, row) pairs of the last rendered photo.
     pub fn pairs(&self) -> usize {
         self.pairs as usize
     }
 
-    /// Returns where the time of all photos so far went.
+    /// Returns the accumulated times of all photos.
     pub fn times(&self) -> TrainingTimes {
         self.times
     }
 
-    /// Destroys the device, as a driver's reset does: to test what takes over.
+    /// Destroys the device, like a driver reset: for tests of the fallback.
     pub fn lose_device(&self) {
         self.device.device.destroy();
     }
 
-    /// Renders rows of `stride` numbers as a photo shows them into `image`, [`CHANNELS`] padded to whole tiles.
-    /// `changed` is what of them may differ from the last photo's.
+    /// Renders rows of `stride` values for a photo into `image`, [`CHANNELS`] channels padded to whole tiles.
+    /// `changed` lists the rows that may differ from those of the last photo.
     ///
     /// # Errors
-    /// [`RenderError::Device`] if the device is lost, or has no room for so much.
+    /// [`RenderError::Device`] if the device is lost, or has too little memory.
     ///
     /// # Panics
-    /// If the image has another size, or rows lack harmonics of the photo's degree.
+    /// If the size of the image is wrong, or rows lack harmonics of the photo's degree.
     pub fn forward(
         &mut self,
         rows: &[f32],
@@ -212,7 +213,7 @@ impl TrainingRenderer {
     ) -> Result<(), RenderError> {
         assert!(
             stride >= 11 + 3 * (usize::from(photo.degree) + 1).pow(2),
-            "{stride} numbers a row"
+            "{stride} values per row"
         );
         assert!(rows.len().is_multiple_of(stride), "whole rows");
         assert_eq!(image.len() as u64, photo.plane() * CHANNELS as u64);
@@ -228,7 +229,7 @@ impl TrainingRenderer {
         shared.regions = (count as u64).div_ceil(BLOCK as u64);
         shared.pairs = u64::from(self.budget.pairs).min(self.limit.shared.pairs);
         shared.tiles = u64::from(self.tiles);
-        // One number more than there are tiles: that of none.
+        // One number more than tiles: that of pairs without a tile.
         shared.tile_digits = sort::digits(u32::BITS - self.tiles.leading_zeros());
         let mut changed = changed;
         loop {
@@ -279,14 +280,14 @@ impl TrainingRenderer {
         }
     }
 
-    /// Takes the derivative of a loss by the last image, [`BY_CHANNELS`] padded to whole tiles, back to the
-    /// rows that it shows; gives these to `take`, nearest first.
+    /// Propagates the derivative of a loss by the last image ([`BY_CHANNELS`] channels padded to whole tiles) back to
+    /// the visible rows, and passes their gradients to `take`, from near to far.
     ///
     /// # Errors
     /// [`RenderError::Device`] if the device is lost.
     ///
     /// # Panics
-    /// If no image was rendered, or `by` has another size.
+    /// If no image was rendered, or the size of `by` is wrong.
     pub fn backward<R>(
         &mut self,
         by: &[f32],
@@ -340,7 +341,7 @@ impl TrainingRenderer {
         taken.map_err(RenderError::Device)
     }
 
-    /// Makes sure of buffers for what is wanted.
+    /// Grows the buffers if the capacity is insufficient.
     fn reserve(&mut self, wanted: &TrainingCapacity) -> Result<(), RenderError> {
         if !wanted.is_within(&self.limit) {
             return Err(RenderError::Device(format!(
@@ -352,7 +353,7 @@ impl TrainingRenderer {
         if self.bound.is_some() && has.holds(wanted) {
             return Ok(());
         }
-        // The old buffers go first: the new ones may need their memory.
+        // The old buffers are dropped first: the new ones may need their memory.
         self.bound = None;
         let buffers = TrainingBuffers::new(&self.device, has.grown_to(wanted, &self.limit));
         let (device, passes, shared) = (&self.device, &self.passes, &buffers.shared);
@@ -382,8 +383,8 @@ impl TrainingRenderer {
         self.device.fault().map_or(Ok(()), |fault| Err(RenderError::Device(fault)))
     }
 
-    /// Brings the device's rows up to date: all of them by the queue, changed ones by [`Upload`]. Returns how many
-    /// `scatter` shall move, and how many numbers of each.
+    /// Updates the rows on the device: all of them through the queue, changed ones through [`Upload`]. Returns the
+    /// number of rows that `scatter` must move, and the number of values of each.
     fn write_rows(
         &mut self,
         rows: &[f32],
@@ -414,8 +415,8 @@ impl TrainingRenderer {
         }
     }
 
-    /// Writes the photo of so many rows of so many numbers, and submits the passes to the image and its copy;
-    /// before them that of the rows which `scatter` shall move.
+    /// Writes a photo of `count` rows of `stride` values, and submits the passes up to the image and its copy; before
+    /// them, the pass that moves the changed rows.
     fn submit_forward(
         &self,
         [count, stride]: [u32; 2],
@@ -437,7 +438,7 @@ impl TrainingRenderer {
             ..Tick::default()
         };
         let view = GpuView::of_size(photo.size);
-        // A row's slot is its index; how many are sorted is known here.
+        // The slot of a row is its index, so the number of keys to sort is known on the host.
         let mut sizes = [0u32; 8];
         sizes[SLOTS.size as usize] = count;
         let mut dispatches = [0u32; 16];
@@ -497,7 +498,7 @@ impl TrainingRenderer {
     }
 }
 
-/// Begins a pass with its two stamps.
+/// Begins a pass with its two timestamps.
 fn begin(
     encoder: &mut wgpu::CommandEncoder,
     label: &str,

@@ -1,11 +1,11 @@
-//! The camera of a photo, and how its rows are rendered, as training's shaders see them.
+//! Camera of a photo and its rendering options, in the form of the training shaders.
 
 use glam::Vec3;
 use zerocopy::{Immutable, IntoBytes};
 
 use super::super::TILE_PX;
 
-/// A pinhole, and how rows are rendered for it. Units of length are the rows'.
+/// Pinhole camera and rendering options. Lengths have the unit of the rows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Photo {
     /// Image width. [px]
@@ -18,15 +18,15 @@ pub struct Photo {
     pub center: [f32; 2],
     /// Rows of `cam_from_world`: right, down, forward. [world]
     pub axes: [Vec3; 3],
-    /// Where the camera is. [world]
+    /// Position of the camera. [world]
     pub position: Vec3,
-    /// What is closer is not seen.
+    /// Minimum depth; closer rows are not visible.
     pub near: f32,
-    /// Slopes between which the projection is linearised at the splat itself, x and y.
+    /// Bounds of the slopes at which the projection is linearised, x and y.
     pub slopes: [[f32; 2]; 2],
-    /// Degree of the harmonics that count, at most that of the rows.
+    /// Degree of the harmonics to use, at most that of the rows.
     pub degree: u8,
-    /// Whether what is smaller than a pixel is dimmed (mip-splatting).
+    /// Whether splats smaller than a pixel are dimmed (mip-splatting).
     pub antialiased: bool,
 }
 
@@ -43,23 +43,23 @@ pub(super) struct GpuPhoto {
     near: [f32; 4],
 }
 
-/// Bytes of a [`GpuPhoto`].
+/// Size of a [`GpuPhoto`]. [byte]
 pub(super) const PHOTO_BYTES: usize = size_of::<GpuPhoto>();
 const _: () = assert!(PHOTO_BYTES == 128);
 
 impl Photo {
-    /// Returns tiles across and down.
+    /// Returns the number of tiles across and down.
     pub(super) fn tiles(&self) -> [u32; 2] {
         [self.width.div_ceil(TILE_PX), self.height.div_ceil(TILE_PX)]
     }
 
-    /// Returns the numbers of a channel, padded to whole tiles.
+    /// Returns the number of values of a channel, padded to whole tiles.
     pub(super) fn plane(&self) -> u64 {
         let [across, down] = self.tiles();
         u64::from(across) * u64::from(down) * u64::from(TILE_PX * TILE_PX)
     }
 
-    /// Returns what shaders see of it and of `count` rows of `stride` numbers.
+    /// Returns the shaders' form for `count` rows of `stride` values.
     pub(super) fn packed(&self, count: u32, stride: u32) -> GpuPhoto {
         let axis = |k: usize| {
             let Vec3 { x, y, z } = self.axes[k];

@@ -1,22 +1,22 @@
-// What all passes of training know of the photo that is rendered.
+// Photo that is rendered: shared by all passes of training.
 
-/// The camera of a photo and the style of its rendering. `photo.rs` holds the same in Rust.
+/// Camera of a photo and its rendering options. `GpuPhoto` of `photo.rs` has the same layout in Rust.
 struct Photo {
-    /// Row of the rotation to the camera's axes; the camera's centre, x.
+    /// Row of the rotation into the camera's axes; x of the camera's centre.
     row_x: vec4<f32>,
-    /// ... y.
+    /// Same for y.
     row_y: vec4<f32>,
-    /// ... z.
+    /// Same for z.
     row_z: vec4<f32>,
     /// fx fy cx cy. [px]
     focal: vec4<f32>,
-    /// Slopes between which a splat is linearised: least x, y, greatest x, y.
+    /// Bounds of the slopes at which a splat is linearised: minimum x, y, maximum x, y.
     slopes: vec4<f32>,
     /// Width, height [px], tiles across, tiles.
     size: vec4<u32>,
-    /// Rows, numbers of each, degree of the harmonics that count, 1 if anti-aliased.
+    /// Number of rows, values of each, degree of the harmonics to use, 1 if anti-aliased.
     rows: vec4<u32>,
-    /// Near plane; nothing.
+    /// Near plane; unused.
     near: vec4<f32>,
 }
 

@@ -1,7 +1,7 @@
-//! Pass 1 of training: rows onto the image plane.
+//! Pass 1 of training: projects rows onto the image plane.
 //!
-//! Budget: the whole row read where it is seen, 44 bytes of it where not; 4 bytes written per row and 48 per
-//! one that is seen. At 1 TB/s: 0.2 ms per million rows of degree 2.
+//! Budget: the whole row is read if it is visible, 44 bytes of it otherwise; 4 bytes written per row and 48 per
+//! visible row. At 1 TB/s: 0.2 ms per million rows of degree 2.
 
 use super::super::device::{Device, Groups, Kernel};
 use super::buffers::TrainingBuffers;
@@ -14,7 +14,7 @@ const SOURCE: &str = concat!(
     include_str!("project.wgsl")
 );
 
-/// The pass.
+/// Pass with its kernel.
 #[derive(Debug)]
 pub(super) struct Project {
     kernel: Kernel,

@@ -1,5 +1,5 @@
-// Pass 1 of training: rows onto the image plane, in the form that `bin.wgsl` and `blend.wgsl` read. A row's
-// slot is its index.
+// Pass 1 of training: projects rows onto the image plane, in the form of `bin.wgsl` and `blend.wgsl`. The slot of a
+// row is its index.
 
 // Mean x, y [px], shear, falloff along x [1/px^2].
 @group(0) @binding(2) var<storage, read_write> shapes: array<vec4<f32>>;
@@ -7,14 +7,14 @@
 @group(0) @binding(3) var<storage, read_write> extents: array<vec4<f32>>;
 // Red, green, blue, camera z.
 @group(0) @binding(4) var<storage, read_write> colours: array<vec4<f32>>;
-// Camera z as bits; EMPTY where the photo does not show the row.
+// Camera z as bits; EMPTY if the row is not visible in the photo.
 @group(0) @binding(5) var<storage, read_write> keys: array<u32>;
 
 /// Extent^2 of the ellipse per level and variance: 2 ln 2.
 const EXTENT2 = 1.3862944;
-/// No splat is wider; guards f32 against overflow. [px]
+/// Maximum extent of a splat; prevents overflow of f32. [px]
 const MAX_EXTENT = 1e18;
-/// -log2 of the least opacity there is; keeps `exp` finite.
+/// -log2 of the minimum opacity; keeps `exp` finite.
 const MAX_LOGIT = 80.0;
 
 fn project_row(row: u32) -> u32 {
@@ -31,7 +31,7 @@ fn project_row(row: u32) -> u32 {
     let reach2 = (level - MIN_LEVEL) * EXTENT2;
     let extent = sqrt(reach2 * vec2(a, c));
     let mean = photo.focal.xy * p.slope + photo.focal.zw;
-    // Positive, so that NaN is not seen: some pixel's centre lies in the box.
+    // Written so that NaN is not visible: the box contains a pixel's centre.
     let is_seen = reach2 >= 0.0
         && all(mean + extent > vec2(0.5))
         && all(mean - extent < vec2<f32>(photo.size.xy) - 0.5)

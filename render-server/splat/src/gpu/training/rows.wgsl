@@ -1,7 +1,7 @@
-// What the projection of rows and its derivative share: a row of parameters, and all that both directions
-// compute. The same as `Projection` of `vizflyt-twin`'s `project.rs`, where its form is explained.
+// Row of parameters, and the values that the projection of rows and its derivative share. Same as `Projection` of
+// `project.rs` in `vizflyt-twin`, where its form is explained.
 
-// Row by row: mean, logarithms of the scales, rotation xyzw, logit of the opacity, harmonics.
+// Per row: mean, logarithms of the scales, rotation xyzw, logit of the opacity, harmonics.
 @group(0) @binding(1) var<storage, read> rows: array<f32>;
 
 const LOG_SCALE = 3u;
@@ -10,14 +10,14 @@ const LOGIT = 10u;
 const SH = 11u;
 
 const BLUR = 0.3;
-/// Half of log2(e): sigma's 1/2, for powers of two.
+/// Half of log2(e): the factor 1/2 of sigma, for powers of two.
 const HALF_LOG2_E = 0.72134752;
 const LOG2_E = 1.442695;
 const LN_2 = 0.6931472;
 const MAX_SCALE = 1e6;
-/// Above its logarithm, where `exp` is still finite.
+/// Greater than the logarithm of MAX_SCALE; `exp` is still finite.
 const MAX_LOG_SCALE = 14.0;
-/// The least share of its opacity that a splat much smaller than a pixel keeps (anti-aliased).
+/// Minimum squared share of its opacity that a splat much smaller than a pixel keeps (anti-aliased).
 const MIN_COMPENSATION2 = 1e-8;
 
 fn number(row: u32, column: u32) -> f32 {
@@ -33,12 +33,12 @@ fn quaternion(row: u32) -> vec4<f32> {
 }
 
 struct Projection {
-    /// Whether it is ahead; the rest is undefined unless it is.
+    /// Whether the row is in front of the camera; otherwise, the other fields are undefined.
     is_ahead: bool,
-    /// From the camera, in the world and along its axes.
+    /// Position relative to the camera, in the world's axes; z along the camera's axis.
     d: vec3<f32>,
     z: f32,
-    /// Slopes, and where the projection is linearised.
+    /// Slopes, and the slopes at which the projection is linearised.
     slope: vec2<f32>,
     at: vec2<f32>,
     /// Rows of J W.
@@ -91,7 +91,7 @@ fn harmonic(row: u32, k: u32) -> vec3<f32> {
     return vector(row, SH + 3u * k);
 }
 
-/// The colour along a unit direction, before it is cut off at 0.
+/// Returns the colour along a unit direction, before clamping to 0.
 fn colour(row: u32, direction: vec3<f32>) -> vec3<f32> {
     let degree = photo.rows.z;
     let x = direction.x;

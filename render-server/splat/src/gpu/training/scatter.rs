@@ -1,7 +1,7 @@
-//! Before pass 1 of training: rows onto the device; where it has them from the last photo, the changed ones alone.
+//! Before pass 1 of training: uploads the rows, or only the changed ones if the device has those of the last photo.
 //!
-//! Budget: 4 bytes per changed row and 4 per number of it over the bus, then 8 moved per number: of 60 k rows of
-//! degree 2, 9.4 MB, 0.4 ms at 25 GB/s.
+//! Budget: 4 bytes per changed row and 4 per value of it over the bus, then 8 bytes moved per value. For 60 k rows of
+//! degree 2: 9.4 MB, 0.4 ms at 25 GB/s.
 
 use zerocopy::IntoBytes;
 
@@ -14,31 +14,31 @@ const SOURCE: &str = include_str!("scatter.wgsl");
 /// Workgroups along x; `GRID` in `scatter.wgsl`.
 const GRID: u32 = 32_768;
 
-/// What of the rows differs from those that the last photo was rendered from.
+/// Rows that differ from those of the last rendered photo.
 #[derive(Clone, Copy, Debug)]
 pub enum Changed<'a> {
-    /// Any of it.
+    /// Any row may differ.
     All,
-    /// Of these rows, each named once, no more than the first numbers.
+    /// Only the first values of these rows differ; each row is listed once.
     Rows {
-        /// Which rows.
+        /// Indices of the rows.
         rows: &'a [u32],
-        /// How many numbers of each.
+        /// Number of changed values of each row.
         columns: usize,
     },
 }
 
-/// Words before the list of rows: rows, numbers of each that changed, numbers of each.
+/// Words before the list of rows: number of rows, changed values of each, values of each.
 const HEADER: usize = 4;
 
 impl Changed<'_> {
-    /// Returns where the changed numbers begin, in words, and where they end: even numbers.
+    /// Returns start and end of the changed values, in words: even numbers.
     fn extent(rows: usize, columns: usize) -> [usize; 2] {
         let first = (HEADER + rows).next_multiple_of(2);
         [first, (first + rows * columns).next_multiple_of(2)]
     }
 
-    /// Returns the words that go over the bus; `None` if that is all numbers, `all` of them.
+    /// Returns the number of words to upload, or `None` if all `all` values are uploaded.
     pub(super) fn words(&self, all: usize) -> Option<u64> {
         match *self {
             Self::All => None,
@@ -50,7 +50,7 @@ impl Changed<'_> {
     }
 }
 
-/// The pass.
+/// Pass with its kernel.
 #[derive(Debug)]
 pub(super) struct Scatter {
     kernel: Kernel,
@@ -65,13 +65,13 @@ impl Scatter {
         device.bind(&self.kernel, &[(0, &training.changes), (1, &training.rows)])
     }
 
-    /// Returns the bytes that [`Self::write`] writes.
+    /// Returns the number of bytes that [`Self::write`] writes.
     pub(super) fn bytes(rows: usize, columns: usize) -> u64 {
         let [_, end] = Changed::extent(rows, columns);
         end as u64 * 4
     }
 
-    /// Writes what `scatter` reads.
+    /// Writes the input of `scatter`.
     pub(super) fn write(
         upload: &Upload,
         values: &[f32],

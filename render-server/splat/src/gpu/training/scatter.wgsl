@@ -1,11 +1,12 @@
-// Before pass 1 of training: changed rows to their places. A thread moves a number, as bits.
+// Before pass 1 of training: copies changed rows to their places. Each thread moves one value, as bits.
 
-// Rows, numbers of each that changed, numbers of each, nothing; which rows; from an even place on their numbers.
+// Number of rows, changed values of each, values of each, unused; then the rows' indices; then, from an even index
+// on, their values.
 @group(0) @binding(0) var<storage, read> changes: array<u32>;
 @group(0) @binding(1) var<storage, read_write> rows: array<u32>;
 
 const HEADER = 4u;
-/// Workgroups along x at most.
+/// Maximum number of workgroups along x.
 const GRID = 32768u;
 
 @compute @workgroup_size(256)

@@ -1,6 +1,6 @@
-// What the device counts on its own, so that nothing is read back in mid-frame.
+// Counts of the device, so that nothing is read back within a step.
 
-/// Indices into `sizes`; `read.rs` reads the same.
+/// Indices into `sizes`; `read.rs` uses the same.
 const REGIONS_WANTED = 0u;
 /// Slots in use, BLOCK per region.
 const SLOTS = 1u;
@@ -10,7 +10,7 @@ const PAIRS_WANTED = 3u;
 /// Pairs in use.
 const PAIRS = 4u;
 
-/// First words of the indirect dispatches, three each, in `dispatches`.
+/// Index of the first of three words of each indirect dispatch in `dispatches`.
 const SORT_SLOTS = 0u;
 const SORT_VISIBLE = 4u;
 const BIN = 8u;

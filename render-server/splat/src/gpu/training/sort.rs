@@ -1,10 +1,10 @@
-//! Pass 3, and again in pass 4: a stable radix sort of (key, value) pairs, 8 bits at a time.
+//! Stable radix sort of (key, value) pairs, 8 bits at a time: pass 3, and again in pass 4.
 //!
-//! Least digit first, three dispatches per digit. Ranks are found in workgroup memory alone: right
-//! for subgroups of any size and for none, without waiting for other workgroups.
+//! Least significant digit first, three dispatches per digit. Ranks are computed in workgroup memory only: correct
+//! for any subgroup size and without subgroups, and without waiting for other workgroups.
 //!
-//! Budget: 20 bytes moved per pair and digit, half of a byte of counts; some 10 us per million pairs
-//! and digit at 1 TB/s.
+//! Budget: 20 bytes moved per pair and digit, half a byte of counts; about 10 us per million pairs and digit at 1
+//! TB/s.
 
 use super::super::device::{Device, Groups, Kernel};
 
@@ -19,14 +19,14 @@ const SOURCE: &str = concat!(
 pub(super) const SORT_GROUP: u64 = 2048;
 const DIGIT_BITS: u32 = 8;
 
-/// The kernels.
+/// Compiled kernels.
 #[derive(Debug)]
 pub(super) struct Sort {
     first: Kernels,
     later: Kernels,
 }
 
-/// Of one digit.
+/// Kernels of one digit.
 #[derive(Debug)]
 struct Kernels {
     count: Kernel,
@@ -34,9 +34,8 @@ struct Kernels {
     scatter: Kernel,
 }
 
-/// What a sort works on. `pairs[0]` is where it starts; each digit moves it to the other. With
-/// `makes_values`, the first digit reads no values but makes them the indices of the keys, and
-/// leaves EMPTY keys out.
+/// Buffers of a sort. The input is `pairs[0]`; each digit moves it to the other buffer. With `makes_values`, the
+/// first digit uses the indices of the keys as values, and drops EMPTY keys.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pairs<'a> {
     pub(super) keys: [&'a wgpu::Buffer; 2],
@@ -45,16 +44,16 @@ pub(super) struct Pairs<'a> {
     pub(super) sizes: &'a wgpu::Buffer,
 }
 
-/// Where the number of keys is, and of the workgroups they take.
+/// Location of the number of keys, and of the number of workgroups for them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Count {
-    /// Word of `sizes`.
+    /// Index into `sizes`.
     pub(super) size: u32,
-    /// First of three words of `dispatches`.
+    /// Index of the first of three words in `dispatches`.
     pub(super) groups: u32,
 }
 
-/// One digit's bindings.
+/// Bindings of one digit.
 #[derive(Debug)]
 pub(super) struct Digit {
     is_first: bool,
@@ -74,9 +73,9 @@ impl Sort {
         Self { first: kernels(1.0), later: kernels(0.0) }
     }
 
-    /// Binds the digits of a sort by keys of up to `bits` bits. The result is in
-    /// `keys[digits % 2]`, `values[digits % 2]`. `counts` is of the keys before and after the first
-    /// digit, which differ where that leaves some out.
+    /// Binds the digits of a sort by keys of up to `bits` bits. The result is in `keys[digits % 2]`,
+    /// `values[digits % 2]`. `counts` refers to the keys before and after the first digit; they differ if it drops
+    /// some.
     pub(super) fn bind(
         &self,
         device: &Device,
@@ -128,12 +127,12 @@ impl Sort {
     }
 }
 
-/// Returns how many digits keys of so many bits have; at least one.
+/// Returns the number of digits of keys of `bits` bits; at least one.
 pub(super) fn digits(bits: u32) -> u32 {
     bits.div_ceil(DIGIT_BITS).max(1)
 }
 
-/// Returns the bytes of counts that sorting so many keys needs.
+/// Returns the size of the counts for sorting `keys` keys. [byte]
 pub(super) fn count_bytes(keys: u64) -> u64 {
     ((keys.div_ceil(SORT_GROUP) + 1) * 4) << DIGIT_BITS
 }

@@ -1,9 +1,9 @@
-// Pass 3, and again in pass 4: one digit of a stable radix sort of (key, value) pairs.
+// One digit of a stable radix sort of (key, value) pairs: pass 3, and again in pass 4.
 //
-// `count` counts the digits of each group of keys, `rows` turns the counts of each digit into
-// places, `scatter` moves. A group's own ranks come from bit masks in workgroup memory: a thread
-// sets its bit in its digit's mask, and its rank is the number of bits below its own. No subgroup
-// operation, no waiting for another workgroup: right for subgroups of any size.
+// `count` counts the digits of each group of keys, `rows` converts the counts of each digit to positions, `scatter`
+// moves. Ranks within a group are computed with bit masks in workgroup memory: a thread sets its bit in its digit's
+// mask, and its rank is the number of set bits below its own. No subgroup operations and no waiting for other
+// workgroups: correct for any subgroup size.
 
 struct Digit {
     shift: u32,
@@ -18,18 +18,18 @@ struct Digit {
 @group(0) @binding(3) var<storage, read> values_in: array<u32>;
 @group(0) @binding(4) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(5) var<storage, read_write> values_out: array<u32>;
-// Per digit and group; then per digit.
+// Counts per digit and group; then per digit.
 @group(0) @binding(6) var<storage, read_write> counts: array<u32>;
 
-/// In the first pass values are the keys' indices, and EMPTY keys are left out.
+/// First pass: values are the indices of the keys, and EMPTY keys are dropped.
 override FIRST: bool = false;
 
 const ROUNDS = SORT_GROUP / 256u;
 
 var<workgroup> tally: array<atomic<u32>, 256>;
-/// Bit t of word w, digit d: thread 32 w + t holds digit d. Word by word.
+/// Bit t of word w of digit d is set if thread 32 w + t has digit d. Stored word by word.
 var<workgroup> masks: array<atomic<u32>, 2048>;
-/// Where the group's next key of each digit goes.
+/// Position of the group's next key of each digit.
 var<workgroup> places: array<u32, 256>;
 
 fn is_in(key: u32) -> bool {
@@ -131,7 +131,7 @@ fn scatter(
             }
         }
         workgroupBarrier();
-        // Now each thread looks after the digit of its own number.
+        // From here on, each thread processes the digit that equals its own index.
         var taken = 0u;
         for (var word = 0u; word < 8u; word++) {
             taken += countOneBits(atomicExchange(&masks[word * 256u + thread], 0u));

@@ -1,7 +1,7 @@
-//! What `project`, `sort`, `bin` and `blend` leave for each other; kept from photo to photo, and only ever grown.
+//! Buffers between `project`, `sort`, `bin` and `blend`; reused for each photo, and only ever grown.
 //!
-//! How many pairs (of tile and row) a photo needs is known to the device alone: it counts what it wants and uses
-//! what there is; where there was too little the buffers are grown and the photo is rendered again.
+//! The number of pairs (of tile and row) of a photo is known only on the device: it counts the required number and
+//! uses the available room. If the room was too small, the buffers grow and the photo is rendered again.
 //!
 //! Memory: 68 bytes per row, 16 per pair, 8 per tile.
 
@@ -11,43 +11,43 @@ use super::super::view::GpuView;
 use super::sort;
 use crate::blocks::BLOCK;
 
-/// How much there must be room for.
+/// Capacity of the buffers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Capacity {
-    /// Rows, in blocks.
+    /// Number of blocks of rows.
     pub(super) regions: u64,
     pub(super) pairs: u64,
     pub(super) tiles: u64,
-    /// Digits of a tile's number; not grown but equalled.
+    /// Number of digits of a tile's index; must be equal, instead of at least as large.
     pub(super) tile_digits: u32,
 }
 
 impl Capacity {
-    /// Returns the greatest that a device can give.
+    /// Returns the maximum capacity of a device.
     pub(super) fn limit(binding_bytes: u64) -> Self {
-        // Binning runs one workgroup of 256 per 256 visible splats, 65535 at most.
+        // Binning runs one workgroup of 256 threads per 256 visible splats, at most 65535.
         let slots = (binding_bytes / 16).min(65_535 * 256);
         Self {
             regions: slots / BLOCK as u64,
-            // The counts of the sort take half a byte each; fewer than 65535 groups sort them.
+            // The counts of the sort take half a byte per pair; fewer than 65535 groups sort them.
             pairs: (binding_bytes / 4).min(65_535 * sort::SORT_GROUP),
             tiles: binding_bytes / 8,
             tile_digits: 4,
         }
     }
 
-    /// Whether it holds another.
+    /// Returns whether it is at least as large as another capacity.
     pub(super) fn holds(&self, other: &Self) -> bool {
         self.pairwise(other).iter().all(|(has, wants)| has >= wants)
             && self.tile_digits == other.tile_digits
     }
 
-    /// Whether a device can give it.
+    /// Returns whether it is within the device's limit.
     pub(super) fn is_within(&self, limit: &Self) -> bool {
         self.pairwise(limit).iter().all(|(wants, limit)| wants <= limit)
     }
 
-    /// Returns room for another too, a quarter more than what has to grow, within a limit.
+    /// Returns a capacity that also holds `other`; sizes that must grow get a quarter more, within the limit.
     pub(super) fn grown_to(&self, other: &Self, limit: &Self) -> Self {
         Self {
             regions: grown(self.regions, other.regions, limit.regions),
@@ -62,7 +62,7 @@ impl Capacity {
     }
 }
 
-/// The buffers; named as in the shaders.
+/// Buffers, named as in the shaders.
 #[derive(Debug)]
 pub(super) struct Buffers {
     pub(super) capacity: Capacity,
@@ -75,9 +75,9 @@ pub(super) struct Buffers {
     pub(super) colours: wgpu::Buffer,
     pub(super) keys: [wgpu::Buffer; 2],
     pub(super) order: [wgpu::Buffer; 2],
-    /// Of sorts.
+    /// Digit counts of sorts.
     pub(super) digits: wgpu::Buffer,
-    /// Tiles per splat.
+    /// Number of tiles of each splat.
     pub(super) counts: wgpu::Buffer,
     pub(super) tiles: [wgpu::Buffer; 2],
     pub(super) slots: [wgpu::Buffer; 2],

@@ -1,7 +1,7 @@
-//! Pass 5 of training: what the tiles summed up, back to the rows' own numbers.
+//! Pass 5 of training: propagates the sums of the tiles to the parameters of the rows.
 //!
-//! Budget: 52 bytes read per pair in random order, a row and 64 bytes written per visible splat. One thread
-//! walks a splat's pairs: one as large as the image takes longest.
+//! Budget: 52 bytes read per pair in random order, a row and 64 bytes written per visible splat. One thread iterates
+//! over the pairs of a splat: one as large as the image takes longest.
 
 use super::super::device::{Device, Groups, Kernel};
 use super::bin::BIN;
@@ -17,7 +17,7 @@ const SOURCE: &str = concat!(
     include_str!("unproject.wgsl")
 );
 
-/// The pass.
+/// Pass with its kernel.
 #[derive(Debug)]
 pub(super) struct Unproject {
     kernel: Kernel,

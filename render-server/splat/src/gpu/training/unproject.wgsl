@@ -1,19 +1,19 @@
-// Pass 5 of training: what the tiles of a splat summed up for it, added in the order of its tiles, and taken
-// back to the numbers of its row. `Flat::backward` of `vizflyt-twin`'s `project.rs` is the same, line by line.
+// Pass 5 of training: adds the sums of a splat in the order of its tiles, and propagates them to the parameters of
+// its row. Same as `Flat::backward` of `project.rs` in `vizflyt-twin`, line by line.
 
-// Slots, nearest first.
+// Slots, from near to far.
 @group(0) @binding(2) var<storage, read> order: array<u32>;
-// Pairs per splat in that order; then per workgroup its first pair.
+// Number of pairs per splat in that order; then the first pair of each workgroup.
 @group(0) @binding(3) var<storage, read> counts: array<u32>;
 @group(0) @binding(4) var<storage, read> places: array<u32>;
 @group(0) @binding(5) var<storage, read> pair_sums: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read> sizes: array<u32>;
-// Per visible splat: by mean, logarithms of the scales, rotation, logit; error; by colour; its row.
+// Per visible splat: by mean, logarithms of the scales, rotation, logit; error; by colour; index of its row.
 @group(0) @binding(7) var<storage, read_write> gradients: array<vec4<f32>>;
 
 const NOWHERE = 0xffffffffu;
 
-/// The derivative by a quaternion of any length, from that by the columns of its rotation.
+/// Returns the derivative by a quaternion of any length, from that by the columns of its rotation.
 fn by_quaternion(turn: vec4<f32>, m: mat3x3<f32>) -> vec4<f32> {
     let size = sqrt(dot(turn, turn));
     let q = turn / size;
@@ -23,11 +23,11 @@ fn by_quaternion(turn: vec4<f32>, m: mat3x3<f32>) -> vec4<f32> {
         q.x * (m[2].x + m[0].z) + q.y * (m[2].y + m[1].z) - 2.0 * q.z * (m[0].x + m[1].y) + q.w * (m[0].y - m[1].x),
         q.x * (m[1].z - m[2].y) + q.y * (m[2].x - m[0].z) + q.z * (m[0].y - m[1].x),
     ) * 2.0;
-    // Only what is across q: its length does not turn.
+    // Only the component perpendicular to q, because its length does not change the rotation.
     return (across - dot(across, q) * q) / size;
 }
 
-/// The derivative of the colour, weighted by `by_rgb`, by the direction.
+/// Returns the derivative of the colour, weighted by `by_rgb`, by the direction.
 fn by_direction(row: u32, direction: vec3<f32>, by_rgb: vec3<f32>) -> vec3<f32> {
     let degree = photo.rows.z;
     let x = direction.x;
@@ -98,7 +98,7 @@ fn unproject(
     let c = p.vv + BLUR;
     let det = p.determinant;
 
-    // The flat splat: mean, shear, falloffs, level.
+    // Projected splat: mean, shear, falloffs, level.
     let shear = p.b / c;
     let fall = HALF_LOG2_E * vec2(c / det, 1.0 / c);
     let by_x = 2.0 * fall.x * s0.y * LN_2;
@@ -146,7 +146,7 @@ fn unproject(
     by_z -= dot(by_slope, p.slope) / p.z;
     var by_d = (photo.row_x.xyz * by_slope.x + photo.row_y.xyz * by_slope.y) / p.z + photo.row_z.xyz * by_z;
 
-    // Colour, where it is not cut off at 0, and the direction it is seen along.
+    // Colour, where it is not clamped to 0, and its viewing direction.
     let distance = sqrt(dot(p.d, p.d));
     let direction = p.d / distance;
     let by_rgb = select(vec3(0.0), by_colour, colour(row, direction) > vec3(0.0));

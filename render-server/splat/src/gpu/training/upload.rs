@@ -1,21 +1,22 @@
-//! Memory that the host writes and the device copies from; kept from step to step, for its allocation costs more
-//! than the copy. All cores write: one alone fills some 5 GB/s.
+//! Memory that the host writes and the device copies from; reused for each step, because its allocation costs more
+//! than the copy. All cores write, because one core reaches only about 5 GB/s.
 
 use rayon::prelude::*;
 
 use super::super::device::Device;
 
-/// A buffer that the host can write, until [`Self::hand_over`]; and again once what was submitted is done.
+/// Buffer that the host can write until [`Self::hand_over`], and again after [`Self::map`] when the submission is
+/// done.
 #[derive(Debug)]
 pub(super) struct Upload {
     buffer: wgpu::Buffer,
 }
 
-/// Bytes that one task copies at a time; views of the memory begin at multiples of 8.
+/// Bytes that one task copies at a time; views of the memory start at multiples of 8.
 pub(super) const PART: usize = 1 << 16;
 
 impl Upload {
-    /// Returns one of so many bytes; a given one if it is large enough.
+    /// Returns a buffer of at least `bytes` bytes; reuses `old` if it is large enough.
     pub(super) fn of(old: Option<Self>, device: &Device, bytes: u64) -> Self {
         old.filter(|old| old.buffer.size() >= bytes).unwrap_or_else(|| Self {
             buffer: device.device.create_buffer(&wgpu::BufferDescriptor {
@@ -27,10 +28,10 @@ impl Upload {
         })
     }
 
-    /// Writes bytes from `at` on, a multiple of 8; as many as are a multiple of 4.
+    /// Writes `bytes` at offset `at`, a multiple of 8; their number must be a multiple of 4.
     ///
     /// # Errors
-    /// What is wrong, if the device is lost.
+    /// If the device is lost.
     pub(super) fn write(&self, at: u64, bytes: &[u8]) -> Result<(), String> {
         bytes.par_chunks(PART).enumerate().try_for_each(|(part, bytes)| {
             let at = at + (part * PART) as u64;
@@ -39,10 +40,11 @@ impl Upload {
         })
     }
 
-    /// Writes pieces of `bytes` each, a multiple of 4, one after the other from `at` on, a multiple of 8.
+    /// Writes pieces of `bytes` bytes each, a multiple of 4, one after the other from offset `at` on, a multiple of
+    /// 8.
     ///
     /// # Errors
-    /// What is wrong, if the device is lost.
+    /// If the device is lost.
     pub(super) fn gather<'a>(
         &self,
         at: u64,
@@ -50,7 +52,7 @@ impl Upload {
         count: usize,
         piece: impl Fn(usize) -> &'a [u8] + Sync,
     ) -> Result<(), String> {
-        // An even number, so that every part begins at a multiple of 8.
+        // An even number, so that every part starts at a multiple of 8.
         let together = (PART / bytes).max(1).next_multiple_of(2);
         (0..count.div_ceil(together)).into_par_iter().try_for_each(|part| {
             let pieces = part * together..count.min((part + 1) * together);
@@ -63,7 +65,7 @@ impl Upload {
         })
     }
 
-    /// Ends the writing, and adds the copy of the first bytes to the beginning of a buffer.
+    /// Ends writing, and adds a copy of the first bytes to the start of a buffer.
     pub(super) fn hand_over(
         &self,
         encoder: &mut wgpu::CommandEncoder,
@@ -74,9 +76,9 @@ impl Upload {
         encoder.copy_buffer_to_buffer(&self.buffer, 0, to, 0, bytes);
     }
 
-    /// Asks for the memory again; it is there once the submission is done and waited for.
+    /// Starts mapping again; the memory is available when the submission is done and the device was polled.
     pub(super) fn map(&self) {
-        // Whether it worked is determined by what follows: no view without it.
+        // The result is checked later: an unmapped buffer has no view.
         self.buffer.map_async(wgpu::MapMode::Write, .., |_| ());
     }
 

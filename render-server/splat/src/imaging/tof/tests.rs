@@ -3,7 +3,7 @@ use glam::DVec3;
 use super::*;
 use crate::imaging::shutter;
 
-/// One frequency of 20 MHz.
+/// Camera with one frequency of 20 MHz.
 const CAMERA: Tof = Tof {
     modulation_hz: 20e6,
     unambiguous_m: LIGHT_MPS / 40e6,
@@ -16,7 +16,7 @@ const CAMERA: Tof = Tof {
     multipath: false,
 };
 
-/// Measures a scene of even reflectivity, of which `depth_m` gives the depth by slopes.
+/// Measures a scene of uniform reflectivity; `depth_m` returns the depth for a slope.
 fn measured(
     tof: &Tof,
     size: (u32, u32),
@@ -37,7 +37,7 @@ fn measured(
     (pixels, out)
 }
 
-/// Depth of what is `distance_m` along every ray.
+/// Returns the depth of a sphere around the camera, `distance_m` along every ray.
 fn sphere(distance_m: f32) -> impl Fn(Vec2) -> f32 {
     move |slope| distance_m / slope.extend(1.0).length()
 }
@@ -51,9 +51,9 @@ fn moments(pixels: &[Pixel], out: &[f32]) -> (f64, f64) {
     (mean, (distances.map(|d| (d - mean).powi(2)).sum::<f64>() / count).sqrt())
 }
 
-/// The formula, and it against buckets of photons that are counted.
+/// Checks the formula, also against counted photons in buckets.
 #[test]
-fn noise_is_that_of_photons_in_four_buckets() {
+fn noise_matches_photons_in_four_buckets() {
     for (distance_m, background_e) in [(1.0, 0.0), (2.0, 0.0), (4.0, 0.0), (4.0, 5000.0)] {
         let tof = Tof { background_e, ..CAMERA };
         let (pixels, out) = measured(&tof, (160, 120), 0.5, sphere(distance_m));
@@ -64,7 +64,7 @@ fn noise_is_that_of_photons_in_four_buckets() {
         assert!((sigma / expected - 1.0).abs() < 0.03, "{distance_m} m: {sigma}, not {expected}");
         assert!((mean - f64::from(distance_m)).abs() < 5.0 * expected / 138.0 + 1e-4);
 
-        // Buckets a quarter of a turn apart, each with normal noise of as many photons.
+        // Four buckets a quarter of a period apart, each with normal noise of its number of photons.
         let (key, table) = (NoiseKey::new(9, 9, 9), Normals::table());
         let phase = f64::from(distance_m) / tof.metres_per_rad();
         let mean_e = (signal_e + background_e) / 4.0;
@@ -83,7 +83,7 @@ fn noise_is_that_of_photons_in_four_buckets() {
         let counted = (measured.map(|off| off * off).sum::<f64>() / 20_000.0).sqrt();
         assert!((counted / expected - 1.0).abs() < 0.03, "{distance_m} m: {counted}");
     }
-    // Without other light the deviation grows with distance; with much of it, with its square.
+    // Without background light, the deviation grows with distance; with strong background light, with its square.
     let at = |tof: &Tof, z: f64| tof.sigma_m(tof.signal_e(0.5, z));
     assert!((at(&CAMERA, 4.0) / at(&CAMERA, 2.0) - 2.0).abs() < 1e-9);
     let sunny = Tof { background_e: 1e9, ..CAMERA };
@@ -91,7 +91,7 @@ fn noise_is_that_of_photons_in_four_buckets() {
 }
 
 #[test]
-fn distances_repeat_after_half_a_wavelength() {
+fn distances_alias_after_half_a_wavelength() {
     let quiet = Tof { signal_e_1m: 1e12, ..CAMERA };
     // c / (2 * 20 MHz) = 7.4948 m.
     assert!((quiet.unambiguous_m - 7.494_811_45).abs() < 1e-9);
@@ -100,7 +100,7 @@ fn distances_repeat_after_half_a_wavelength() {
         let (mean, sigma) = moments(&pixels, &out);
         assert!((mean - shown_m).abs() < 1e-3 && sigma < 1e-3, "{true_m} m: {mean}");
     }
-    // Out of range is no return: too near, and repeated to too near.
+    // Out of range, without a return: too near, and aliased to too near.
     for true_m in [0.05, 7.55] {
         assert!(measured(&quiet, (32, 24), 0.8, sphere(true_m)).1.iter().all(|&z| z == 0.0));
     }
@@ -109,16 +109,16 @@ fn distances_repeat_after_half_a_wavelength() {
     assert!(measured(&dim, (32, 24), 0.5, sphere(4.0)).1.iter().all(|&z| z > 0.0));
 }
 
-/// A corner of two white walls, 90 degrees apart, whose edge is upright, 2 m ahead.
+/// Depth of a corner of two white walls at 90 degrees, with a vertical edge 2 m ahead.
 fn corner(slope: Vec2) -> f32 {
-    // x = +-(2 - z): walls to both sides that meet at z = 2.
+    // x = +-(2 - z): walls on both sides that meet at z = 2.
     2.0 / (1.0 + slope.x.abs())
 }
 
-/// Cells along each side of the image that are summed.
+/// Cells along each side of the image in the summation.
 const FINE: i32 = 240;
 
-/// The corner's indirect light, summed finely in f64 from the geometry itself.
+/// Indirect light of the corner, summed finely in f64 from the geometry.
 fn integrated_m(tof: &Tof, slope: DVec3, white: f64) -> f64 {
     let s = core::f64::consts::FRAC_1_SQRT_2;
     let wall = |x: f64| if x > 0.0 { DVec3::new(-s, 0.0, -s) } else { DVec3::new(s, 0.0, -s) };
@@ -139,7 +139,7 @@ fn integrated_m(tof: &Tof, slope: DVec3, white: f64) -> f64 {
                 continue;
             }
             let (dq, way) = (q.length(), q - p);
-            // Solid angle of the cell, cast onto the wall.
+            // Solid angle of the cell, projected onto the wall.
             let cell = 4.0 * half_x * half_y / f64::from(FINE * FINE);
             let area = cell * q.z * q.z * q.z / -other.dot(q);
             let falls = -other.dot(q) / dq / (dq * dq);
@@ -155,7 +155,7 @@ fn integrated_m(tof: &Tof, slope: DVec3, white: f64) -> f64 {
 }
 
 #[test]
-fn corners_look_further_away_by_the_light_that_bounces_once() {
+fn single_bounces_make_corners_appear_further_away() {
     let tof = Tof { signal_e_1m: 1e12, multipath: true, ..CAMERA };
     let (pixels, out) = measured(&tof, (320, 240), 0.8, corner);
     for x in [60usize, 100, 130, 190, 220, 260] {
@@ -170,7 +170,7 @@ fn corners_look_further_away_by_the_light_that_bounces_once() {
             "column {x}: {off_m} m, not {expected_m} m"
         );
     }
-    // An even wall sends nothing to itself.
+    // A flat wall does not illuminate itself.
     let (pixels, out) = measured(&tof, (320, 240), 0.8, |_| 2.0);
     let worst = pixels.iter().zip(&out).map(|(_, z)| (z - 2.0).abs()).fold(0.0, f32::max);
     assert!(worst < 2e-3, "{worst} m");

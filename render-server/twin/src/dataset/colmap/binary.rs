@@ -1,4 +1,4 @@
-//! cameras.bin, images.bin, points3D.bin: little-endian records after their count.
+//! cameras.bin, images.bin, points3D.bin: a count, then little-endian records.
 
 use std::collections::HashMap;
 
@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3};
 use super::{Cameras, ColmapError, lens};
 use crate::dataset::sparse::{SparseImage, SparsePoint, SparseSighting, pose};
 
-/// Bytes still to read.
+/// Reader of the remaining bytes.
 struct Bytes<'a> {
     rest: &'a [u8],
     whole: usize,
@@ -46,7 +46,7 @@ impl<'a> Bytes<'a> {
         Ok(out)
     }
 
-    /// Reads how many records of at least so many bytes follow.
+    /// Reads the number of the following records, of at least `least` bytes each.
     fn count(&mut self, least: usize) -> Result<usize, ColmapError> {
         let count = self.u64()?;
         let fits = usize::try_from(count)
@@ -118,7 +118,7 @@ pub fn images(bytes: &[u8], cameras: &Cameras) -> Result<Vec<SparseImage>, Colma
         let mut seen = Vec::new();
         for _ in 0..bytes.count(24)? {
             let pixel = DVec2::from_array(bytes.f64s()?);
-            // All ones is no point.
+            // An id of all ones means no point.
             let point = bytes.u64()?;
             let is_point = point != u64::MAX && pixel.is_finite();
             seen.extend(is_point.then_some(SparseSighting { point, pixel }));

@@ -4,7 +4,7 @@ use vizflyt_protocol::geometry::{Distortion, Intrinsics};
 
 use super::ColmapError;
 
-/// Name and count of parameters, by the model's number.
+/// Name and number of parameters, by the model's number.
 const MODELS: [(&str, usize); 12] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -20,13 +20,13 @@ const MODELS: [(&str, usize); 12] = [
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 ];
 
-/// Returns a model's name and count of parameters.
+/// Returns a model's name and number of parameters.
 pub(super) fn of_number(number: i32) -> Result<(&'static str, usize), ColmapError> {
     let model = usize::try_from(number).ok().and_then(|n| MODELS.get(n));
     model.copied().ok_or_else(|| ColmapError::Lens(format!("number {number}")))
 }
 
-/// Returns the intrinsics of a model by its name.
+/// Returns the intrinsics of a named model.
 pub(super) fn intrinsics(
     name: &str,
     width: u64,
@@ -61,7 +61,7 @@ pub(super) fn intrinsics(
         _ => return Err(ColmapError::Lens(name.to_owned())),
     };
     let distortion = match distortion {
-        // No bend is no lens.
+        // All coefficients zero: no distortion.
         Distortion::BrownConrady { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 } => {
             Distortion::None
         }
@@ -81,7 +81,7 @@ pub(super) fn intrinsics(
     Ok(intrinsics)
 }
 
-/// Returns COLMAP's name of a lens, and its parameters.
+/// Returns COLMAP's name of a lens model, and its parameters.
 ///
 /// ```
 /// use vizflyt_protocol::geometry::Intrinsics;
@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_told_of_a_lens_is_read_back() {
+    fn reads_back_written_lens_parameters() {
         let plain = Intrinsics::from_horizontal_fov(640, 480, 1.2);
         for distortion in [
             Distortion::None,

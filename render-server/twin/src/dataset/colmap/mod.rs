@@ -15,21 +15,21 @@ pub use self::write::write;
 use super::error::{DatasetError, read_file};
 use super::sparse::SparseModel;
 
-/// Why bytes are no model: where, and what.
+/// Why bytes are not a valid model.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ColmapError {
-    /// The file ends early, or has a number that cannot be.
+    /// The file is truncated or has an invalid value.
     #[error("{0}")]
     Damaged(String),
-    /// A lens that is not understood.
+    /// Unsupported lens.
     #[error("camera model {0} is not understood")]
     Lens(String),
 }
 
-/// Cameras by their ids.
+/// Cameras by id.
 pub type Cameras = HashMap<u32, Intrinsics>;
 
-/// Returns the folder of a dataset that holds a model, if one does.
+/// Returns the folder with a model inside a dataset, if any.
 pub fn find(folder: &Path) -> Option<PathBuf> {
     let places = ["sparse/0", "sparse", "colmap/sparse/0", ""];
     let has = |path: &Path| {
@@ -38,10 +38,10 @@ pub fn find(folder: &Path) -> Option<PathBuf> {
     places.iter().map(|place| folder.join(place)).find(|path| has(path))
 }
 
-/// Reads the model in a folder: of the files of either kind, the binary ones.
+/// Reads the model in a folder; binary files have priority over text files.
 ///
 /// # Errors
-/// [`DatasetError`] says which file is wrong, and what to do.
+/// [`DatasetError`], which names the file and the remedy.
 pub fn read(folder: &Path) -> Result<SparseModel, DatasetError> {
     let is_binary = folder.join("cameras.bin").is_file();
     let kind = if is_binary { "bin" } else { "txt" };

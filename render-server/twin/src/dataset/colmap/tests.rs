@@ -1,4 +1,4 @@
-//! Models in text and in binary, and what is wrong with them.
+//! Models in text and binary form, and invalid ones.
 
 use glam::DVec3;
 use proptest::prelude::*;
@@ -15,7 +15,7 @@ const SEEN: [SparseSighting; 1] =
 const POINTS: &str = "7 1.5 2.5 3.5 10 20 30 0.4 3 0 4 1\n";
 
 #[test]
-fn text_is_read() {
+fn reads_text() {
     let cameras = text::cameras(CAMERAS).unwrap();
     assert_eq!(cameras[&1].fy_px, 401.0);
     let bent = Distortion::BrownConrady { k1: 0.1, k2: -0.05, p1: 0.001, p2: 0.002, k3: 0.0 };
@@ -32,7 +32,7 @@ fn text_is_read() {
 }
 
 #[test]
-fn text_says_what_is_wrong() {
+fn text_error_names_the_fault() {
     let cameras = text::cameras(CAMERAS).unwrap();
     let check = |result: Result<(), ColmapError>, says: &str| {
         let error = result.unwrap_err().to_string();
@@ -88,7 +88,7 @@ fn binary() -> [Vec<u8>; 3] {
 }
 
 #[test]
-fn binary_is_read_and_every_cut_is_noticed() {
+fn reads_binary_and_rejects_every_truncation() {
     let [camera_bytes, image_bytes, point_bytes] = binary();
     let cameras = binary::cameras(&camera_bytes).unwrap();
     let images = binary::images(&image_bytes, &cameras).unwrap();
@@ -124,7 +124,7 @@ fn binary_is_read_and_every_cut_is_noticed() {
 
 proptest! {
     #[test]
-    fn noise_is_an_error_or_a_model(bytes in proptest::collection::vec(any::<u8>(), 0..400)) {
+    fn does_not_panic_on_random_bytes(bytes in proptest::collection::vec(any::<u8>(), 0..400)) {
         let cameras = Cameras::new();
         let _ = (binary::cameras(&bytes), binary::images(&bytes, &cameras), binary::points(&bytes));
         let text = String::from_utf8_lossy(&bytes);
@@ -133,7 +133,7 @@ proptest! {
 }
 
 #[test]
-fn a_model_that_is_written_is_read_back() {
+fn reads_back_a_written_model() {
     let cameras = text::cameras(CAMERAS).unwrap();
     let images = text::images(IMAGES, &cameras).unwrap();
     let points = HashMap::from([(

@@ -1,5 +1,4 @@
-//! cameras.txt, images.txt, points3D.txt: a record a line, but two lines an image; `#` begins a
-//! comment.
+//! cameras.txt, images.txt, points3D.txt: one record per line, two lines per image; `#` starts a comment.
 
 use std::collections::HashMap;
 use std::str::{FromStr, SplitWhitespace};
@@ -26,7 +25,7 @@ impl<'a> Line<'a> {
 
     fn value<T: FromStr>(&mut self, what: &str) -> Result<T, ColmapError> {
         let text = self.text(what)?;
-        text.parse().map_err(|_| self.damaged(&format!("{what} is '{text}', no such number")))
+        text.parse().map_err(|_| self.damaged(&format!("{what} is '{text}', not a valid number")))
     }
 
     fn values<const N: usize>(&mut self, what: &str) -> Result<[f64; N], ColmapError> {
@@ -38,13 +37,13 @@ impl<'a> Line<'a> {
     }
 }
 
-/// Returns all lines but comments, blank ones too.
+/// Returns all lines except comments, including blank ones.
 fn lines(text: &str) -> impl Iterator<Item = Line<'_>> {
     let all = text.lines().enumerate().filter(|(_, line)| !line.starts_with('#'));
     all.map(|(i, line)| Line { number: i + 1, fields: line.split_whitespace() })
 }
 
-/// Returns lines that say something.
+/// Returns all lines except comments and blank ones.
 fn records(text: &str) -> impl Iterator<Item = Line<'_>> {
     lines(text).filter(|line| line.fields.clone().next().is_some())
 }
@@ -82,7 +81,7 @@ pub fn images(text: &str, cameras: &Cameras) -> Result<Vec<SparseImage>, ColmapE
         let translation = line.values::<3>("the translation")?;
         let camera: u32 = line.value("the camera's id")?;
         let first = line.text("the image's name")?;
-        // Names may hold spaces.
+        // Names may contain spaces.
         let name = std::iter::once(first).chain(line.fields.by_ref()).collect::<Vec<_>>().join(" ");
         let Some(world_from_cam) = pose(rotation, translation) else {
             return Err(line.damaged("no rotation and translation"));
@@ -90,12 +89,12 @@ pub fn images(text: &str, cameras: &Cameras) -> Result<Vec<SparseImage>, ColmapE
         let Some(&intrinsics) = cameras.get(&camera) else {
             return Err(line.damaged(&format!("camera {camera} is not among the cameras")));
         };
-        // The second line is there even if the image sees nothing.
+        // The second line exists even if the image sees no points.
         let mut seen = Vec::new();
         if let Some(mut points) = lines.next() {
             while points.fields.clone().next().is_some() {
                 let pixel = DVec2::from_array(points.values("a point's pixel")?);
-                // -1 is no point.
+                // An id of -1 means no point.
                 let id: i64 = points.value("a point's id")?;
                 let point = u64::try_from(id).ok().filter(|_| pixel.is_finite());
                 seen.extend(point.map(|point| SparseSighting { point, pixel }));

@@ -1,4 +1,4 @@
-//! A model as cameras.txt, images.txt and points3D.txt, which every tool of COLMAP's world reads.
+//! Writes a model as cameras.txt, images.txt and points3D.txt, which all tools for COLMAP read.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -10,16 +10,16 @@ use super::parameters;
 use crate::dataset::error::DatasetError;
 use crate::dataset::sparse::SparseModel;
 
-/// Writes a model into a folder, which is made where it is absent. Images are numbered in their order, from 1.
+/// Writes a model into a folder, which is created if missing. Images are numbered in their order, from 1.
 ///
 /// # Errors
-/// A file that cannot be written.
+/// [`DatasetError::Io`] if a file cannot be written.
 pub fn write(folder: &Path, model: &SparseModel) -> Result<(), DatasetError> {
     let mut lenses: Vec<Intrinsics> = Vec::new();
     let mut images = String::from(
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# X, Y, POINT3D_ID\n",
     );
-    // By point: which image saw it, and as its how many-th.
+    // Track of each point: image number and index of the observation in the image.
     let mut tracks: BTreeMap<u64, String> = BTreeMap::new();
     for (number, image) in (1..).zip(&model.images) {
         let known = lenses.iter().position(|lens| *lens == image.intrinsics);
@@ -56,7 +56,7 @@ pub fn write(folder: &Path, model: &SparseModel) -> Result<(), DatasetError> {
     for (id, point) in sorted {
         let (p, [r, g, b]) = (point.position, point.rgb);
         let track = tracks.get(id).map_or("", String::as_str);
-        // The error is not known any more; 0 by its format.
+        // The reprojection error is not stored; 0 is valid in the format.
         let _ = writeln!(points, "{id} {} {} {} {r} {g} {b} 0{track}", p.x, p.y, p.z);
     }
     let io = |path: &Path| {

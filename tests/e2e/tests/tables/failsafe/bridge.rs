@@ -1,4 +1,4 @@
-//! The Wi-Fi bridge between the vehicle's serial line and the network: the chips' own core.
+//! The Wi-Fi bridge between the vehicle's serial line and the network, with the core of the chips' firmware.
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 
@@ -11,22 +11,22 @@ use super::rig::Wires;
 /// Address of the guardian's port.
 const GUARDIAN: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(192, 168, 4, 2), 14550);
 
-/// A bridge on a chip that has power.
+/// A bridge with power.
 pub(crate) struct WifiBridge {
     bridge: Bridge,
-    /// Hung: neither the bridge nor its network stack answers.
+    /// The bridge hangs: neither it nor its network stack reacts.
     pub(crate) is_hung: bool,
 }
 
 impl WifiBridge {
-    /// Switches one on.
+    /// Switches a bridge on.
     pub(crate) fn new(now: HostTime) -> Self {
         let settings = Settings { client: Some(GUARDIAN), ..Settings::default() };
         let chip = Chip { address: [2, 0, 0, 0, 0, 1], random: [7; 16] };
         Self { bridge: Bridge::new(now, settings, chip), is_hung: false }
     }
 
-    /// Returns when it has something to do.
+    /// Returns the next time at which the bridge has work.
     pub(crate) fn due(&self, now: HostTime, wires: &Wires) -> Option<HostTime> {
         if self.is_hung {
             return None;
@@ -42,7 +42,7 @@ impl WifiBridge {
         dues.into_iter().flatten().min()
     }
 
-    /// Does what is due.
+    /// Does all work that is due.
     pub(crate) fn turn(&mut self, now: HostTime, wires: &mut Wires) {
         if self.is_hung {
             wires.uart_from_vehicle.clear();

@@ -1,4 +1,4 @@
-//! The guardian's process: its judgement between the runtime's socket and the autopilot's port.
+//! The guardian's process: its core between the runtime's socket and the autopilot's port.
 
 use vizflyt_guardian::port::Wanted;
 use vizflyt_guardian::watch::{Out, Watch};
@@ -6,25 +6,25 @@ use vizflyt_protocol::time::HostTime;
 
 use super::rig::{Wires, host};
 
-/// Period of its clock, as in the guardian's main thread. [ns]
+/// Clock period, as in the guardian's main thread. [ns]
 const TICK_NS: i64 = 10_000_000;
 
-/// From the guardian to the runtime.
+/// Message from the guardian to the runtime.
 #[derive(Clone, Debug)]
 pub(crate) enum ToRuntime {
-    /// Bytes of the autopilot.
+    /// Bytes from the autopilot.
     Mavlink(Vec<u8>),
-    /// A sentence for people.
+    /// A message for people.
     Note(&'static str),
 }
 
-/// A guardian that runs.
+/// A running guardian.
 pub(crate) struct Guardian {
     watch: Watch,
     tick_at: HostTime,
-    /// The runtime's end of the socket closes.
+    /// Time at which the runtime's end of the socket closes.
     pub(crate) socket_closes_at: Option<HostTime>,
-    /// The autopilot has sent something: its address is known.
+    /// The autopilot has sent a packet, so its address is known.
     has_partner: bool,
 }
 
@@ -38,12 +38,12 @@ impl Guardian {
         }
     }
 
-    /// Whether it leaves.
+    /// Returns whether the guardian ends.
     pub(crate) fn is_over(&self, now: HostTime) -> bool {
         self.watch.is_over(now)
     }
 
-    /// Returns when it has something to do.
+    /// Returns the next time at which the guardian has work.
     pub(crate) fn due(&self, wires: &Wires) -> Option<HostTime> {
         let dues = [
             Some(self.tick_at),
@@ -55,7 +55,7 @@ impl Guardian {
         dues.into_iter().flatten().min()
     }
 
-    /// Does what is due.
+    /// Does all work that is due.
     pub(crate) fn turn(&mut self, now: HostTime, wires: &mut Wires) {
         while let Some(bytes) = wires.from_vehicle.receive(now) {
             self.has_partner = true;
@@ -83,7 +83,7 @@ impl Guardian {
     }
 }
 
-/// The UDP port that waits for the autopilot, and the socket of the runtime.
+/// The UDP port for the autopilot, and the socket of the runtime.
 struct Port<'a> {
     now: HostTime,
     wires: &'a mut Wires,

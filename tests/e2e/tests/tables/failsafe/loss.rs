@@ -1,4 +1,4 @@
-//! Losses: each joint of the chain between a pose and a motor, broken in flight.
+//! Losses in flight: each part of the chain between pose and motor fails.
 
 use vizflyt_guardian::watch::COMPONENT_ID as GUARDIAN;
 use vizflyt_protocol::mavlink::CopterMode;
@@ -17,39 +17,39 @@ use super::runtime::Settings;
 enum Loss {
     /// The runtime is killed.
     Runtime,
-    /// The runtime is stopped, as one that hangs.
+    /// The runtime is stopped, as if it hangs.
     Stopped,
     /// The runtime and its guardian are killed.
     Jetson,
-    /// MAVLink stops both ways: Wi-Fi. [s]
+    /// MAVLink stops in both directions, as on a loss of Wi-Fi. [s]
     Mavlink(f64),
-    /// The bridge is stopped, as one that hangs.
+    /// The bridge is stopped, as if it hangs.
     BridgeHangs,
     /// The bridge is without power. [s]
     Bridge(f64),
-    /// The motion capture sees nothing. [s]
+    /// The motion capture sends no poses. [s]
     Poses(f64),
     /// The server is killed.
     Server,
     /// The autopilot reboots.
     Autopilot,
-    /// Runtime, guardian, poses and MAVLink.
+    /// Loss of runtime, guardian, poses and MAVLink.
     All,
 }
 
-/// For ever, as far as a flight goes. [s]
+/// Longer than any flight. [s]
 const FOR_EVER: f64 = 1e6;
 
-/// Component that lands the vehicle.
+/// What lands the vehicle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum By {
-    /// The first LAND that reaches the autopilot is this component's.
+    /// The first LAND that reaches the autopilot comes from this component.
     Order(u8),
-    /// The autopilot has to find out.
+    /// A failsafe of the autopilot.
     Autopilot,
-    /// Its own weight.
+    /// Gravity.
     Gravity,
-    /// It flies on.
+    /// Nothing: the vehicle flies on.
     FliesOn,
 }
 
@@ -57,18 +57,18 @@ enum By {
 #[derive(Debug)]
 pub(crate) struct Case {
     loss: Loss,
-    /// How the row reads.
+    /// Name in the table.
     pub(crate) name: &'static str,
-    /// Who notices, and what it does.
+    /// Reaction, with the part that reacts.
     pub(crate) does: &'static str,
-    /// Whether its MAVLink goes through a bridge.
+    /// MAVLink goes through a bridge.
     bridge: bool,
     by: By,
-    /// LAND begins this long after the loss at most. [s]
+    /// Maximum time from the loss to LAND. [s]
     land_within_s: f64,
 }
 
-/// Flown at each of [`SPEEDS`].
+/// Losses at each of [`SPEEDS_MPS`].
 const AT_ALL_SPEEDS: [Case; 11] = [
     Case {
         loss: Loss::Runtime,
@@ -162,12 +162,12 @@ const AT_ALL_SPEEDS: [Case; 11] = [
 
 const BY_AUTOPILOT: &str = "autopilot: stops by GUID_TIMEOUT, LAND by FS_GCS_TIMEOUT";
 
-/// Flown at the least of [`SPEEDS`].
+/// Losses at the lowest of [`SPEEDS_MPS`].
 const AT_ONE_SPEED: [Case; 6] = [
     Case {
         loss: Loss::Autopilot,
         name: "the autopilot reboots in flight",
-        does: "nobody can: motors stop, it falls",
+        does: "none possible: motors stop, it falls",
         bridge: false,
         by: By::Gravity,
         land_within_s: 0.0,
@@ -214,46 +214,46 @@ const AT_ONE_SPEED: [Case; 6] = [
     },
 ];
 
-/// Speeds at which vehicles are struck. [m/s]
+/// Speeds at the time of the loss. [m/s]
 const SPEEDS_MPS: [f64; 3] = [0.35, 1.0, 2.5];
 
-/// One flight: a row at a speed.
+/// One flight: a loss at a speed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Run {
     pub(crate) case: &'static Case,
     pub(crate) speed_mps: f64,
-    /// Of noise and delays.
+    /// Seed of noise and delays.
     seed: u64,
 }
 
-/// Down means this near the floor. [m]
+/// Maximum height of a vehicle that is down. [m]
 const DOWN_M: f64 = 0.05;
-/// How long a vehicle that shall fly on is watched after the loss is over. [s]
+/// Time after the end of the loss for which a vehicle that flies on is observed. [s]
 const WATCH_S: f64 = 3.0;
-/// One that is to land has had its time after this. [s]
+/// Maximum time until a vehicle is down. [s]
 const LONGEST_S: f64 = 20.0;
-/// A vehicle is on its way after this. [s]
+/// Maximum time until a vehicle flies. [s]
 const READY_S: f64 = 60.0;
-/// Poses by the guardian's own feed until a vehicle is down: 50 a second.
+/// Minimum number of the guardian's poses until the vehicle is down: 50 per second.
 const GUARDIAN_POSES: u32 = 80;
 
-/// A flight as measured.
+/// Measured result of a flight.
 #[derive(Clone, Debug)]
 pub(crate) struct Row {
     pub(crate) run: Run,
-    /// From the loss until it stood, or came straight down. [s]
+    /// Time from the loss until the vehicle stopped, or only descended. [s]
     pub(crate) stands_s: Option<f64>,
-    /// From the loss until LAND was entered. [s]
+    /// Time from the loss to LAND. [s]
     pub(crate) lands_s: Option<f64>,
-    /// From the last good pose until it was down. [s]
+    /// Time from the last good pose until the vehicle was down. [s]
     pub(crate) down_s: Option<f64>,
-    /// Greatest horizontal distance from where it was at the last good pose, until it was down or
-    /// the loss was over. [m]
+    /// Maximum horizontal distance from the position of the last good pose, until the vehicle was down or the loss
+    /// ended. [m]
     pub(crate) drift_m: f64,
-    /// Component of the first order to LAND.
+    /// Component that first ordered LAND.
     ordered_by: Option<u8>,
     guardian_poses: u32,
-    /// Whether it stayed inside the room's fence all the way.
+    /// The vehicle stayed inside the room's fence.
     is_inside: bool,
     pub(crate) hash: u64,
 }
@@ -267,7 +267,7 @@ pub(crate) fn runs() -> Vec<Run> {
     (1..).zip(at_all.chain(at_one)).map(seeded).collect()
 }
 
-/// Flies a run: strikes a vehicle that flies at its speed, and watches the rest of the flight.
+/// Flies a run: causes the loss at the run's speed, and observes the rest of the flight.
 pub(crate) fn fly(place: &Place, params: &[(String, f32)], run: Run) -> Row {
     let Run { case, speed_mps, seed } = run;
     let deeds = [Deed::World(DVec3::X * speed_mps)];
@@ -282,7 +282,7 @@ pub(crate) fn fly(place: &Place, params: &[(String, f32)], run: Run) -> Row {
     let over_s = strike(&mut rig, case);
     let since_s = |rig: &Rig| rig.now_s() - last_good.at_s;
     let lands = case.by != By::FliesOn;
-    // One that lands is watched until it is down, or ought to be; one that flies on for a while.
+    // A landing vehicle is observed until it is down or overdue; one that flies on, for a while.
     rig.until(case.name, 2.0 * LONGEST_S, |rig| {
         if lands {
             rig.sight().p_m.z < DOWN_M || since_s(rig) > LONGEST_S
@@ -293,7 +293,7 @@ pub(crate) fn fly(place: &Place, params: &[(String, f32)], run: Run) -> Row {
     measure(place, run, &rig, last_good, over_s)
 }
 
-/// Lets the loss happen, and end if it does; returns how long it lasts, 0 for ever. [s]
+/// Causes the loss, and ends it if it is temporary; returns its duration, 0 if permanent. [s]
 fn strike(rig: &mut Rig, case: &Case) -> f64 {
     let since_s = rig.now_s();
     let lasts_s = match case.loss {
@@ -348,7 +348,7 @@ fn measure(place: &Place, run: Run, rig: &Rig, last_good: Sight, over_s: f64) ->
     let fence = &place.arena.geofence;
     Row {
         run,
-        // One that flies on stands later too, at the end of its way.
+        // A vehicle that flies on also stops later, at the end of its path.
         stands_s: stands_s(&lost, &last_good).filter(|&s| lands || s <= over_s),
         lands_s: rig.seen.modes.iter().filter(is_land).find_map(|&(at_s, _)| after(at_s)),
         down_s,
@@ -362,7 +362,7 @@ fn measure(place: &Place, run: Run, rig: &Rig, last_good: Sight, over_s: f64) ->
     }
 }
 
-/// When the vehicle first moved along the ground by less than 3 cm in a fifth of a second.
+/// Returns when the vehicle first moved less than 3 cm horizontally in 0.2 s.
 fn stands_s(lost: &[&Sight], last_good: &Sight) -> Option<f64> {
     let mut later = 0;
     lost.iter().find_map(|sight| {
@@ -375,15 +375,15 @@ fn stands_s(lost: &[&Sight], last_good: &Sight) -> Option<f64> {
 }
 
 impl Run {
-    /// From 1.2 m. [s]
+    /// Returns the maximum time until down, from 1.2 m. [s]
     fn down_within_s(self) -> f64 {
         if self.case.by == By::Autopilot { 9.0 } else { 5.0 }
     }
 
-    /// From where it was at the last good pose. [m]
+    /// Returns the maximum drift from the position of the last good pose. [m]
     fn drift_within_m(self) -> f64 {
         match (self.case.by, self.case.loss) {
-            // Blind for eight seconds.
+            // Without control for eight seconds.
             (By::Autopilot, _) => 2.0 + 0.8 * self.speed_mps,
             // The bridge waits for a second.
             (_, Loss::Jetson | Loss::Mavlink(_)) => 0.5 + self.speed_mps,
@@ -393,7 +393,7 @@ impl Run {
 }
 
 impl Row {
-    /// Returns what breaks the promise.
+    /// Returns the violated requirement, if any.
     pub(crate) fn complaint(&self) -> Option<String> {
         let Run { case, speed_mps, .. } = self.run;
         let complain = |what: String| Some(format!("{}, {speed_mps} m/s: {what}", case.name));
@@ -429,7 +429,7 @@ impl Row {
 }
 
 impl Row {
-    /// Returns the row as the guide's table has it.
+    /// Returns the row in the format of the guide's table.
     pub(crate) fn line(&self) -> String {
         let Run { case, speed_mps, .. } = self.run;
         let seconds =

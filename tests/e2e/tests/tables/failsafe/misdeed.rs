@@ -1,4 +1,4 @@
-//! Misdeeds: what a plugin does wrong never reaches the vehicle, and one sentence says why.
+//! Plugin faults: they never reach the vehicle, and one message gives the reason.
 
 use vizflyt_protocol::messages::{EventKind, FlightPhase, OutcomeKind};
 use vizflyt_protocol::time::HostTime;
@@ -7,27 +7,27 @@ use super::plugin::Deed;
 use super::rig::{Place, Plan, Rig};
 use super::runtime::Settings;
 
-/// A misdeed, and what is to come of it.
+/// A plugin fault and the expected reaction.
 pub(crate) struct Case {
     deeds: &'static [Deed],
-    /// The plugin is started again this often.
+    /// Number of restarts of the plugin.
     restarts: u32,
-    /// Time in the air; 0 is the arena's. [s]
+    /// Time limit in the air; 0 uses the arena's. [s]
     time_limit_s: f64,
-    /// The vehicle stands, or comes straight down, this long after the misdeed at most. [s]
+    /// Maximum time from the fault until the vehicle stops, or only descends. [s]
     holds_within_s: f64,
-    /// It is on its way down this long after at most; `None` if it only holds. [s]
+    /// Maximum time from the fault until landing begins; `None` if it only holds. [s]
     lands_within_s: Option<f64>,
     outcome: OutcomeKind,
-    /// The sentence that the student reads.
+    /// Message for the student.
     sentence: &'static str,
 }
 
-/// The plugin is gone: the runtime brakes and lands without being asked.
+/// The plugin has ended: the runtime brakes and lands at once.
 const AT_ONCE_S: (f64, Option<f64>) = (1.0, Some(1.5));
-/// It sends nothing: half a second, braking, as slowly as ArduCopter's defaults brake; two seconds, landing.
+/// The plugin sends nothing: brakes after 0.5 s (as slowly as ArduCopter's defaults), lands after 2 s.
 const SILENT_S: (f64, Option<f64>) = (1.3, Some(2.1));
-/// Side of the fence that the vehicles fly at. [m, world]
+/// Side of the fence in the direction of flight. [m, world]
 pub(crate) const FENCE_X_M: f64 = 2.6;
 
 const fn case(
@@ -44,7 +44,7 @@ pub(crate) const CASES: [Case; 14] = [
     case(&[Deed::Panic], AT_ONCE_S, "the plugin failed: panicked at"),
     case(&[Deed::Spin], SILENT_S, "the plugin has not answered image"),
     case(&[Deed::Sleep], SILENT_S, "the plugin has not answered image"),
-    // As long as it takes to fill the memory, it flies.
+    // Flies until the memory is full.
     case(&[Deed::Leak], (3.0, Some(3.5)), "more than its 200 MB of memory"),
     case(&[Deed::Fork], AT_ONCE_S, "more than its 40 processes and threads"),
     case(&[Deed::Exit], AT_ONCE_S, "the plugin ended by itself (exit status 0)"),
@@ -54,7 +54,7 @@ pub(crate) const CASES: [Case; 14] = [
     Case {
         outcome: OutcomeKind::Landed,
         time_limit_s: 7.0,
-        // From its place to the fence at 3 m/s at most, braking.
+        // From the start to the fence at 3 m/s at most, and braking.
         ..case(&[Deed::Outside], (4.0, None), "asks to leave the geofence; the vehicle stops")
     },
     case(&[Deed::Flood], AT_ONCE_S, "more than 400 setpoints a second"),
@@ -71,7 +71,7 @@ pub(crate) const CASES: [Case; 14] = [
     },
 ];
 
-/// Flies a case; returns the flight's hash and what was not as stated.
+/// Flies a case; returns the flight's hash, and the violated requirement, if any.
 pub(crate) fn fly(place: &Place, case: &Case) -> (u64, Option<String>) {
     let Case { deeds, restarts, time_limit_s, .. } = *case;
     let settings = Settings { deeds, restarts, time_limit_s };
@@ -122,7 +122,7 @@ impl Case {
         }
         let said =
             |text: &str| runtime.events.iter().filter(|(_, e)| e.text.contains(text)).count();
-        // One sentence, not a hundred.
+        // A few messages, not a hundred.
         let count = said(self.sentence);
         if !(1..=12).contains(&count) {
             return Some(format!("'{}' was reported {count} times", self.sentence));

@@ -1,6 +1,6 @@
-//! The failsafe tables on a virtual clock: every loss in flight at three speeds, and every misdeed of a plugin. The
-//! programs' own sans-IO cores fly each flight twice, with the same bits. `linkloss` and `misbehave`
-//! fly a few of them with real processes.
+//! Failsafe tables on a virtual clock: every loss in flight at three speeds, and every plugin fault. The sans-IO cores
+//! of the programs fly each flight twice, with bit-identical results. `linkloss` and `misbehave` fly a few of them with
+//! real processes.
 
 mod bridge;
 mod guardian;
@@ -25,7 +25,7 @@ use rig::Place;
 #[test]
 fn vehicle_lands_in_time_or_flies_on_after_any_loss() {
     let place = place(|arena| {
-        // No goal is reached.
+        // The goal is never reached.
         arena.goal.as_mut().expect("the room has a goal").radius_m = 0.01;
     });
     let params = vizflyt_e2e::airframe_parameters();
@@ -41,7 +41,7 @@ fn vehicle_lands_in_time_or_flies_on_after_any_loss() {
 #[test]
 fn vehicle_holds_or_lands_for_any_plugin_fault() {
     let place = place(|arena| {
-        // A fence that is soon reached.
+        // Put the fence near the start.
         arena.geofence.max_m.x = misdeed::FENCE_X_M;
         let goal = arena.goal.as_mut().expect("the room has a goal");
         (goal.position_m.x, goal.radius_m) = (2.3, 0.01);
@@ -51,7 +51,7 @@ fn vehicle_holds_or_lands_for_any_plugin_fault() {
     assert!(complaints.is_empty(), "{complaints:#?}");
 }
 
-/// Returns the generated room, empty, as `change` has it.
+/// Returns the generated room without obstacles, modified by `change`.
 fn place(change: impl FnOnce(&mut ArenaConfig)) -> Place {
     let mut arena = generate(SceneKind::Room, 0).arena;
     change(&mut arena);
@@ -59,7 +59,7 @@ fn place(change: impl FnOnce(&mut ArenaConfig)) -> Place {
     Place { arena, obstacles: Arc::new(DistanceField::of(empty)) }
 }
 
-/// Flies each of `flights` twice; returns the results. Panics if the two have different hashes.
+/// Flies each of `flights` twice; returns the results. Panics if the hashes of the two differ.
 fn twice<F: Sync, T: Send>(flights: &[F], fly: impl Fn(&F) -> (u64, T) + Sync) -> Vec<T> {
     let next = AtomicUsize::new(0);
     let work = || {
@@ -80,7 +80,7 @@ fn twice<F: Sync, T: Send>(flights: &[F], fly: impl Fn(&F) -> (u64, T) + Sync) -
     let mut done = done.into_iter();
     while let (Some((index, (first, result))), Some((_, (second, _)))) = (done.next(), done.next())
     {
-        assert_eq!(first, second, "flight {} took another way the second time", index / 2);
+        assert_eq!(first, second, "flight {} differs the second time", index / 2);
         results.push(result);
     }
     results

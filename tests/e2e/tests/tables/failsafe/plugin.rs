@@ -1,6 +1,6 @@
-//! A plugin as far as its runtime sees it: a model of `jetson/runtime/examples/misbehave.rs`, which flies well for
-//! twenty images and then does its deed. What a supervisor finds out (exits, signals, memory, processes) comes here
-//! as its sentence; `supervisor/tests.rs` and `misbehave` have the real processes.
+//! Model of a plugin for the runtime, after `jetson/runtime/examples/misbehave.rs`: it flies well for twenty images,
+//! then causes its fault. The reports of a supervisor (exits, signals, memory, processes) are given here as texts;
+//! `supervisor/tests.rs` and `misbehave` use real processes.
 
 use std::collections::VecDeque;
 
@@ -10,10 +10,10 @@ use vizflyt_protocol::messages::{
 };
 use vizflyt_protocol::time::HostTime;
 
-/// What a plugin does.
+/// Behaviour of a plugin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Deed {
-    /// Asks for this velocity from the first image on. [m/s, world]
+    /// Requests this velocity from the first image on. [m/s, world]
     World(DVec3),
     Panic,
     Spin,
@@ -31,76 +31,76 @@ pub(crate) enum Deed {
     Land,
 }
 
-/// What comes of an image.
+/// Reaction to an image.
 #[derive(Clone, Debug)]
-#[allow(clippy::large_enum_variant)] // Why: a handful a flight, in a test.
+#[allow(clippy::large_enum_variant)] // Why: few per flight, in a test.
 enum Act {
-    /// The reply, after so long. [s]
+    /// Reply after a delay. [s]
     Reply(f64, Setpoint),
     /// `on_image` does not return.
     Hang,
-    /// A failure is reported before the process ends.
+    /// Reports a failure before the process ends.
     Fail(&'static str),
-    /// The process ends after so long, by the supervisor's sentence. [s]
+    /// The process ends after a delay, with the supervisor's message. [s]
     End(f64, &'static str),
     /// Replies without end.
     Flood,
-    /// Bytes that are no message.
+    /// Bytes that are not a message.
     Garbage,
 }
 
-/// What the runtime gets.
+/// Input of the runtime.
 #[derive(Clone, Debug)]
-#[allow(clippy::large_enum_variant)] // Why: a handful a flight, in a test.
+#[allow(clippy::large_enum_variant)] // Why: few per flight, in a test.
 pub(crate) enum Output {
     /// The process has opened its end of the shared memory.
     Attached,
-    /// A message, or why it cannot be decoded.
+    /// A message, or its decoding error.
     Message(Result<FromPlugin, String>),
-    /// The process has ended; the supervisor's sentence.
+    /// The process has ended, with the supervisor's message.
     Exited(&'static str),
 }
 
-/// A plugin, one process after another.
+/// A plugin and its restarted processes.
 pub(crate) struct Plugin {
     deeds: VecDeque<Deed>,
     /// Images seen while flying.
     images: u64,
     flies: bool,
-    /// What is on its way to the runtime.
+    /// Output that has not reached the runtime yet.
     outputs: VecDeque<(HostTime, Output)>,
-    /// `on_image` runs until then.
+    /// End of the running `on_image`.
     busy_until: HostTime,
     /// Newest image that `on_image` has not seen.
     waiting: Option<u64>,
-    /// The process has ended, or never returns.
+    /// The process has ended or hangs.
     is_gone: bool,
     /// Instant of the first deed.
     pub(crate) deed_at: Option<HostTime>,
 }
 
-/// A process that is not ready sees no images.
+/// End time of a process that is not ready to see images.
 const NOT_READY: HostTime = HostTime::from_ns(u64::MAX);
-/// Images flown well before the deed.
+/// Number of images before the fault.
 const GOOD_IMAGES: u64 = 20;
-/// Images in which 200 MB are lost, 20 MB each.
+/// Number of images until 200 MB are leaked, 20 MB each.
 const LEAKS: u64 = 10;
-/// Time that `on_image` takes. [s]
+/// Duration of `on_image`. [s]
 const ON_IMAGE_S: f64 = 0.005;
-/// From the start of a process until it attaches, and from there until it waits for images: as a plugin in Python. [s]
+/// Time from the start of a process to its attachment, and from there until it is ready: as a Python plugin. [s]
 const STARTS_S: f64 = 0.5;
-/// From the last message of a process that has failed to its end. [s]
+/// Time from the last message of a failed process to its end. [s]
 const LAST_WORDS_S: f64 = 0.02;
-/// From the end of a process until the runtime has noticed. [s]
+/// Time from the end of a process until the runtime detects it. [s]
 const NOTICED_S: f64 = 0.003;
-/// Replies of a flood, and the time between two of them. [ns]
+/// Number of replies in a flood, and their interval. [ns]
 const FLOOD: i64 = 10_000;
 const FLOOD_NS: i64 = 100_000;
-/// What the sensible part of a flight asks for. [m/s, heading]
+/// Velocity before the fault. [m/s, heading]
 const FORWARD_MPS: f64 = 0.5;
 
 impl Plugin {
-    /// Starts one that will do these deeds, one after another if it is started again.
+    /// Starts a plugin with these faults, one for each start of its process.
     pub(crate) fn start(now: HostTime, deeds: &[Deed]) -> Self {
         let mut plugin = Self {
             deeds: deeds.iter().copied().collect(),
@@ -116,7 +116,7 @@ impl Plugin {
         plugin
     }
 
-    /// Starts its process again.
+    /// Restarts its process.
     pub(crate) fn start_process(&mut self, now: HostTime) {
         (self.images, self.flies, self.waiting, self.is_gone) = (0, false, None, false);
         self.busy_until = NOT_READY;
@@ -124,13 +124,13 @@ impl Plugin {
         self.outputs.push_back((now.plus_seconds(STARTS_S), Output::Attached));
     }
 
-    /// Returns when it does something.
+    /// Returns the next time at which the plugin has work.
     pub(crate) fn due(&self) -> Option<HostTime> {
         let image = self.waiting.map(|_| self.busy_until).filter(|_| !self.is_gone);
         self.outputs.front().map(|(at, _)| *at).into_iter().chain(image).min()
     }
 
-    /// Takes a message of the runtime.
+    /// Handles a message of the runtime.
     pub(crate) fn handle_message(&mut self, now: HostTime, message: &ToPlugin) {
         match message {
             ToPlugin::Start(_) => {
@@ -147,12 +147,12 @@ impl Plugin {
         }
     }
 
-    /// Takes an image; only the newest is kept for a plugin that is busy.
+    /// Handles an image; a busy plugin keeps only the newest.
     pub(crate) fn handle_image(&mut self, seq: u64) {
         self.waiting = Some(seq);
     }
 
-    /// Returns what has come of it.
+    /// Returns the next output.
     pub(crate) fn poll(&mut self, now: HostTime) -> Option<Output> {
         if !self.is_gone
             && now >= self.busy_until
@@ -220,7 +220,7 @@ fn forward() -> Act {
 }
 
 impl Deed {
-    /// Returns what comes of the image with this number, from 1, since the deed began.
+    /// Returns the reaction to an image, counted from 1 since the fault began.
     fn act(self, image: u64) -> Act {
         let reply = |setpoint| Act::Reply(ON_IMAGE_S, setpoint);
         let velocity = |v_mps| reply(Setpoint::velocity(v_mps, YawTarget::Keep));

@@ -1,5 +1,5 @@
-//! The lab on one virtual clock: vehicle, bridge, guardian, runtime, server and motion capture, each the program's own
-//! sans-IO core, joined by links with seeded delays.
+//! The lab on one virtual clock: vehicle, bridge, guardian, runtime, server and motion capture. Each uses the sans-IO
+//! core of its program; links between them have seeded delays.
 //!
 //! ```text
 //! Simulation ── capture ─▶ Server ── poses, events, images ─▶ Runtime ◀──▶ Plugin (a model)
@@ -7,8 +7,8 @@
 //!     │ └── MAVLink (─ serial line ─ WifiBridge) ──▶ │
 //!     └──────────────────────────────────────────────┘
 //! ```
-//! [`Rig::step`] goes on to the next instant at which anything is due. A loss is what the operating system makes of it:
-//! a process that is killed is gone and its socket closes, one that is stopped does nothing and nothing closes.
+//! [`Rig::step`] advances to the next time at which any part has work. Losses follow the operating system: a killed
+//! process is gone and its socket closes; a stopped process does nothing and nothing closes.
 
 use std::sync::Arc;
 
@@ -30,24 +30,24 @@ use super::wire::Wire;
 
 /// The vehicle's name in the motion capture.
 pub(crate) const OBJECT: &str = "vehicle";
-/// Where the clocks start: far enough from zero that nothing is before it. [ns]
+/// Start of the clocks, far enough from zero for earlier times. [ns]
 const START_NS: u64 = 10_000_000_000;
 const TICK_NS: i64 = (1_000_000_000 / TICK_HZ).cast_signed();
-/// A connection whose other end has died ends after this silence. [s]
+/// Timeout of a connection whose other end has died. [s]
 const CONNECTION_LOST_S: f64 = 5.0;
-/// The socket of a killed process closes after this. [s]
+/// Time until the socket of a killed process closes. [s]
 const SOCKET_CLOSES_S: f64 = 0.002;
-/// Least time from one step to the next. [ns]
+/// Minimum time of a step. [ns]
 const LEAST_STEP_NS: i64 = 1000;
-/// Link of the autopilot that is not the companion's.
+/// Autopilot port that the companion does not use.
 const TELEMETRY_PORT: usize = 1;
 
-/// Returns a server's stamp on the computer's clock: they are one.
+/// Converts a server time to the computer's clock: they are equal.
 pub(crate) fn host(stamp: ServerTime) -> HostTime {
     HostTime::from_ns(stamp.as_ns())
 }
 
-/// Returns a stamp of the computer on the server's clock.
+/// Converts a time of the computer to the server's clock.
 pub(crate) fn server(now: HostTime) -> ServerTime {
     ServerTime::from_ns(now.as_ns())
 }
@@ -60,7 +60,7 @@ pub(crate) struct Wires {
     pub(crate) poses: Wire<PoseSample>,
     /// Server to runtime.
     pub(crate) events: Wire<Event>,
-    /// Server to runtime: stamps of the poses that images were rendered from.
+    /// Server to runtime: stamps of the rendered poses.
     pub(crate) images: Wire<HostTime>,
     /// Server to guardian.
     pub(crate) feed: Wire<PoseSample>,
@@ -84,7 +84,7 @@ pub(crate) struct Wires {
 
 impl Wires {
     fn new(seed: u64) -> Self {
-        // Cables: within a millisecond; an image is rendered, encoded, sent and decoded; the radio.
+        // Delays: cables within a millisecond; images with rendering, encoding, sending and decoding; the radio.
         let (local, image, socket, radio) = ((200, 1500), (20_000, 30_000), (10, 60), (300, 2500));
         Self {
             capture: Wire::new(seed, 1, local),
@@ -103,7 +103,7 @@ impl Wires {
         }
     }
 
-    /// Cuts MAVLink both ways, or joins it again.
+    /// Cuts MAVLink in both directions, or restores it.
     pub(crate) fn cut_mavlink(&mut self, is_cut: bool) {
         (self.to_vehicle.is_cut, self.from_vehicle.is_cut) = (is_cut, is_cut);
     }
@@ -112,24 +112,24 @@ impl Wires {
 /// One pose of the motion capture.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sight {
-    /// When it was true, since the start. [s]
+    /// Time since the start. [s]
     pub(crate) at_s: f64,
-    /// Where the vehicle was. [m, world]
+    /// Position of the vehicle. [m, world]
     pub(crate) p_m: DVec3,
 }
 
-/// What is seen of a flight from outside.
+/// External observations of a flight.
 #[derive(Default)]
 pub(crate) struct Seen {
     /// Poses of the motion capture, also while they are cut.
     pub(crate) track: Vec<Sight>,
-    /// The autopilot's modes, and when each began. [s]
+    /// Modes of the autopilot, with their start. [s]
     pub(crate) modes: Vec<(f64, CopterMode)>,
-    /// Orders to LAND that reached the autopilot: when, and of which component. [s]
+    /// LAND orders that reached the autopilot: time and component. [s]
     pub(crate) orders: Vec<(f64, u8)>,
-    /// Poses of the guardian's that reached the autopilot.
+    /// Number of the guardian's poses that reached the autopilot.
     pub(crate) guardian_poses: u32,
-    /// Hash of all motion, of everything that reached the autopilot, and of every event.
+    /// Hash of all motion, of all packets to the autopilot, and of every event.
     hash: u64,
 }
 
@@ -147,7 +147,7 @@ impl Seen {
         self.hash(bytes.len() as u64);
     }
 
-    /// Takes note of a packet that has reached the autopilot.
+    /// Records a packet that has reached the autopilot.
     fn packet(&mut self, at_s: f64, packet: &[u8]) {
         const COMMAND_LONG: [u8; 3] = [76, 0, 0];
         const VISION_POSITION_ESTIMATE: [u8; 3] = [102, 0, 0];
@@ -168,14 +168,14 @@ impl Seen {
     }
 }
 
-/// A place to fly in, shared by its flights.
+/// A place for flights, shared by several.
 #[derive(Clone)]
 pub(crate) struct Place {
     pub(crate) arena: ArenaConfig,
     pub(crate) obstacles: Arc<DistanceField>,
 }
 
-/// How a flight begins.
+/// Conditions of a flight.
 pub(crate) struct Plan<'a> {
     pub(crate) place: &'a Place,
     /// Parameters of the autopilot that differ from its defaults.
@@ -184,12 +184,12 @@ pub(crate) struct Plan<'a> {
     pub(crate) radio: bool,
     /// MAVLink goes through a bridge.
     pub(crate) bridge: bool,
-    /// Of all noise and delays.
+    /// Seed of noise and delays.
     pub(crate) seed: u64,
     pub(crate) settings: Settings<'a>,
 }
 
-/// A flight under way.
+/// A running flight.
 pub(crate) struct Rig {
     now: HostTime,
     tick_at: HostTime,
@@ -249,17 +249,17 @@ impl Rig {
         self.runtime.as_ref().expect("the runtime runs")
     }
 
-    /// Whether the autopilot's motors may turn.
+    /// Returns whether the autopilot is armed.
     pub(crate) fn is_armed(&self) -> bool {
         self.simulation.autopilot().is_armed()
     }
 
-    /// Returns the hash of the whole flight so far.
+    /// Returns the hash of the flight so far.
     pub(crate) fn hash(&self) -> u64 {
         self.seen.hash
     }
 
-    /// Flies on until `done`.
+    /// Continues the flight until `done` returns true.
     pub(crate) fn until(&mut self, what: &str, within_s: f64, mut done: impl FnMut(&Self) -> bool) {
         let limit_s = self.now_s() + within_s;
         while !done(self) {
@@ -268,7 +268,7 @@ impl Rig {
         }
     }
 
-    /// Returns the runtime's events, for messages.
+    /// Returns the runtime's events, for failure messages.
     pub(crate) fn story(&self) -> String {
         let events = self.runtime.iter().flat_map(|runtime| &runtime.events);
         let lines: Vec<_> =
@@ -278,7 +278,7 @@ impl Rig {
 
     // ---- losses ----
 
-    /// Kills the runtime: its plugin goes with it, its guardian does not.
+    /// Kills the runtime and its plugin, but not its guardian.
     pub(crate) fn kill_runtime(&mut self) {
         self.runtime = None;
         if let Some(guardian) = &mut self.guardian {
@@ -286,7 +286,7 @@ impl Rig {
         }
     }
 
-    /// Stops the runtime, as one that hangs.
+    /// Stops the runtime, as if it hangs.
     pub(crate) fn stop_runtime(&mut self) {
         self.runtime.as_mut().expect("it runs").is_stopped = true;
     }
@@ -303,27 +303,27 @@ impl Rig {
         self.runtime.as_mut().expect("it runs").server_lost_at = Some(lost_at);
     }
 
-    /// Stops the bridge, as one that hangs.
+    /// Stops the bridge, as if it hangs.
     pub(crate) fn hang_bridge(&mut self) {
         self.bridge.as_mut().expect("it flies through a bridge").is_hung = true;
     }
 
-    /// Takes the bridge's power away.
+    /// Switches the bridge off.
     pub(crate) fn kill_bridge(&mut self) {
         self.bridge = None;
     }
 
-    /// Gives the bridge power again: it has forgotten everything.
+    /// Switches the bridge on again, without its former state.
     pub(crate) fn restart_bridge(&mut self) {
         self.bridge = Some(WifiBridge::new(self.now));
     }
 
-    /// Reboots the autopilot, armed as it is.
+    /// Reboots the autopilot while armed.
     pub(crate) fn reboot_autopilot(&mut self) {
         let reboot = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
             command: MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN,
             param1: 1.0,
-            // While armed it must be forced, as a fault would.
+            // While armed, the reboot must be forced, as by a fault.
             param6: 20_190_226.0,
             target_system: 1,
             target_component: 1,
@@ -336,7 +336,7 @@ impl Rig {
 
     // ---- time ----
 
-    /// Goes on to the next instant at which something is due, and does it.
+    /// Advances to the next time at which a part has work, and does that work.
     pub(crate) fn step(&mut self) {
         let Self { wires, now, .. } = self;
         let into_vehicle =
@@ -398,7 +398,7 @@ impl Rig {
         self.reach_vehicle();
     }
 
-    /// Hands the vehicle what has reached it.
+    /// Delivers received packets to the vehicle.
     fn reach_vehicle(&mut self) {
         let (now, at_s) = (self.now, self.now_s());
         let wire = if self.has_bridge {
@@ -412,7 +412,7 @@ impl Rig {
         }
     }
 
-    /// Lets the vehicle fly on for a tick; sends what it and the motion capture send.
+    /// Simulates the vehicle for a tick; sends the packets of vehicle and motion capture.
     fn tick_vehicle(&mut self) {
         self.tick_at = self.tick_at.plus_ns(TICK_NS);
         self.simulation.tick();

@@ -1,4 +1,4 @@
-//! The runtime's process: the companion, and what its driver on the wall clock does around it, `control`.
+//! The runtime's process: the companion, and a model of its driver `control`, which runs on the wall clock.
 
 use vizflyt_arena::ArenaConfig;
 use vizflyt_protocol::flight_end::PluginFault;
@@ -14,38 +14,38 @@ use super::guardian::ToRuntime;
 use super::plugin::{Deed, Output, Plugin};
 use super::rig::{Wires, host};
 
-/// What a flight is to be.
+/// Settings of a flight.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Settings<'a> {
-    /// What the plugin does.
+    /// Behaviour of the plugin.
     pub(crate) deeds: &'a [Deed],
-    /// A plugin that fails in flight is started again, this often.
+    /// Maximum number of restarts of a plugin that fails in flight.
     pub(crate) restarts: u32,
-    /// Time in the air; 0 leaves it to the arena. [s]
+    /// Time limit in the air; 0 uses the arena's. [s]
     pub(crate) time_limit_s: f64,
 }
 
-/// A runtime that runs.
+/// A running runtime.
 pub(crate) struct Runtime {
     pub(crate) companion: Companion,
     pub(crate) plugin: Plugin,
     limiter: RateLimiter,
     seq: u64,
-    /// Events, its own and the server's, and when each was reported.
+    /// Events of the runtime and of the server, with their times.
     pub(crate) events: Vec<(HostTime, Event)>,
     restarts_allowed: u32,
-    /// Times the plugin was started again.
+    /// Number of restarts of the plugin.
     pub(crate) restarts: u32,
-    /// The plugin's process is on its way out, and another one will be started.
+    /// The plugin's process is ending, and another one will start.
     is_leaving: bool,
-    /// It is stopped, as one that hangs: nothing closes.
+    /// The process is stopped, as if it hangs; nothing closes.
     pub(crate) is_stopped: bool,
-    /// Its connection to a server that has died times out.
+    /// Time at which the connection to a dead server times out.
     pub(crate) server_lost_at: Option<HostTime>,
 }
 
 impl Runtime {
-    /// Starts one, which the server of `arena` has welcomed.
+    /// Starts a runtime that is connected to the server of `arena`.
     pub(crate) fn new(now: HostTime, arena: &ArenaConfig, settings: Settings<'_>) -> Self {
         let Settings { deeds, restarts, time_limit_s } = settings;
         let settings = FlightSettings {
@@ -73,17 +73,17 @@ impl Runtime {
         }
     }
 
-    /// Returns the phase of flight.
+    /// Returns the flight phase.
     pub(crate) fn phase(&self) -> FlightPhase {
         self.companion.flight().phase()
     }
 
-    /// Returns the flight's outcome, once it is over.
+    /// Returns the outcome of the flight after its end.
     pub(crate) fn outcome(&self) -> Option<OutcomeKind> {
         self.companion.flight().outcome().map(vizflyt_protocol::flight_end::EndReason::outcome)
     }
 
-    /// Returns when it has something to do.
+    /// Returns the next time at which the runtime has work.
     pub(crate) fn due(&self, wires: &Wires) -> Option<HostTime> {
         if self.is_stopped {
             return None;
@@ -100,7 +100,7 @@ impl Runtime {
         dues.into_iter().flatten().min()
     }
 
-    /// Does what is due.
+    /// Does all work that is due.
     pub(crate) fn turn(&mut self, now: HostTime, wires: &mut Wires) {
         if self.is_stopped {
             return;
@@ -173,7 +173,7 @@ impl Runtime {
         }
     }
 
-    /// Starts it again, or gives it up, by the policy of `control`.
+    /// Restarts the plugin, or gives up, by the policy of `control`.
     fn plugin_failed(&mut self, now: HostTime, sentence: &str) {
         if self.is_leaving {
             return;

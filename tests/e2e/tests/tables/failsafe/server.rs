@@ -1,5 +1,5 @@
-//! The render server: the driver of the motion capture, filter and rules, poses and images for the runtime, poses for
-//! the guardian. Images are their stamps: no plugin here looks at pixels.
+//! The render server: motion capture driver, filter and rules; poses and images for the runtime, poses for the
+//! guardian. Images are only stamps, because no plugin here uses pixels.
 
 use std::sync::Arc;
 
@@ -14,19 +14,19 @@ use super::rig::{OBJECT, Wires, host, server};
 
 /// Period of the images. [ns]
 const IMAGE_NS: i64 = 50_000_000;
-/// Least time between two poses for the runtime, as in the server's session. [s]
+/// Minimum interval of poses for the runtime, as in the server's session. [s]
 const POSE_EVERY_S: f64 = 0.0095;
-/// Least time between two poses for the guardian, as in the server's feed. [s]
+/// Minimum interval of poses for the guardian, as in the server's feed. [s]
 const FED_EVERY_S: f64 = 0.018;
 
-/// The server of one vehicle.
+/// Server of one vehicle.
 pub(crate) struct Server {
     stream: ViconStream,
     referee: Referee,
     newest: Option<PoseSample>,
     sent: ServerTime,
     fed: ServerTime,
-    /// Pose of the newest image.
+    /// Stamp of the pose of the newest image.
     rendered: ServerTime,
     image_at: HostTime,
 }
@@ -45,7 +45,7 @@ impl Server {
         }
     }
 
-    /// Returns when it has something to do.
+    /// Returns the next time at which the server has work.
     pub(crate) fn due(&self, wires: &Wires) -> Option<HostTime> {
         let image = self.has_unseen_pose().then_some(self.image_at);
         let silence = self.referee.poll_timeout().map(host);
@@ -59,7 +59,7 @@ impl Server {
         self.newest.is_some_and(|newest| newest.stamp > self.rendered)
     }
 
-    /// Does what is due.
+    /// Does all work that is due.
     pub(crate) fn turn(&mut self, now: HostTime, wires: &mut Wires) {
         while let Some(reading) = wires.imu.receive(now) {
             self.referee.handle_imu(&reading);
@@ -76,7 +76,7 @@ impl Server {
                 }
             }
         }
-        // While poses come, time is theirs, as in the pose thread.
+        // While poses arrive, their stamps are the time, as in the pose thread.
         self.referee.handle_timeout(judged_at.unwrap_or(server(now)));
         while let Some(event) = self.referee.poll_event() {
             wires.events.send(now, event);

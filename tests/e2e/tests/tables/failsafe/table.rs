@@ -1,4 +1,4 @@
-//! The table of `docs/guides/failsafe.md`: held against the flights, or written there.
+//! Compares the table of `docs/guides/failsafe.md` with the flights, or writes it.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -8,11 +8,11 @@ use super::loss::Row;
 const BEGIN: &str = "<!-- losses: begin -->\n";
 const END: &str = "<!-- losses: end -->";
 const HEAD: &str = "\
-| what is lost | who notices, and does what | at | stands after | LAND after | down after | drift |
+| loss | reaction | at | stands after | LAND after | down after | drift |
 |---|---|---|---|---|---|---|
 ";
 
-/// Checks that the guide has these rows to the letter; with `VIZFLYT_FAILSAFE=write` writes them there.
+/// Asserts that the guide has exactly these rows; `VIZFLYT_FAILSAFE=write` writes them.
 pub(crate) fn check(rows: &[Row]) {
     let mut table = HEAD.to_owned();
     for row in rows {

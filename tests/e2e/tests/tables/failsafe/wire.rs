@@ -1,4 +1,4 @@
-//! Links on the virtual clock: what is sent arrives later, in order, after a seeded delay.
+//! Links on the virtual clock: items arrive in order, after a seeded delay.
 
 use std::collections::VecDeque;
 
@@ -9,17 +9,17 @@ use vizflyt_protocol::time::HostTime;
 #[derive(Clone, Debug)]
 pub(crate) struct Wire<T> {
     random: SplitMix64,
-    /// Least and greatest delay. [us]
+    /// Minimum and maximum delay. [us]
     delay_us: (u64, u64),
     on_their_way: VecDeque<(HostTime, T)>,
-    /// Arrival of the newest: nothing overtakes.
+    /// Arrival of the newest item: items do not overtake each other.
     newest: HostTime,
-    /// Drops everything that is sent.
+    /// Drops all items.
     pub(crate) is_cut: bool,
 }
 
 impl<T> Wire<T> {
-    /// Makes link number `stream` of the links with this seed.
+    /// Creates link number `stream` of the links with this seed.
     pub(crate) fn new(seed: u64, stream: u64, delay_us: (u64, u64)) -> Self {
         Self {
             random: SplitMix64::new(seed.wrapping_mul(0xD1B5_4A32_D192_ED03) ^ stream << 32),
@@ -30,14 +30,14 @@ impl<T> Wire<T> {
         }
     }
 
-    /// Sends, to arrive after a delay.
+    /// Sends an item, which arrives after a delay.
     pub(crate) fn send(&mut self, now: HostTime, item: T) {
         let (least, most) = self.delay_us;
         let delay_us = least + self.random.bits() % (most - least + 1);
         self.send_for(now.plus_ns(1000 * delay_us.cast_signed()), item);
     }
 
-    /// Sends, to arrive at `at` or behind what was sent before.
+    /// Sends an item, which arrives at `at` or after earlier items.
     pub(crate) fn send_for(&mut self, at: HostTime, item: T) {
         if !self.is_cut {
             self.newest = self.newest.max(at);
@@ -50,24 +50,24 @@ impl<T> Wire<T> {
         self.on_their_way.pop_front_if(|(at, _)| *at <= now).map(|(_, item)| item)
     }
 
-    /// Returns when the next item arrives.
+    /// Returns the arrival time of the next item.
     pub(crate) fn due(&self) -> Option<HostTime> {
         self.on_their_way.front().map(|(at, _)| *at)
     }
 
-    /// Drops everything that is on its way: nobody receives it.
+    /// Drops all items in transit.
     pub(crate) fn clear(&mut self) {
         self.on_their_way.clear();
     }
 }
 
-/// Time that one byte takes on a serial line of 921600 baud. [ns]
+/// Time of one byte on a serial line of 921600 baud. [ns]
 const BYTE_NS: i64 = 10_000_000_000 / 921_600;
-/// Bytes that are dropped wait longer than this: the line's buffer is full. [s]
+/// Backlog above which bytes are dropped: the line's buffer is full. [s]
 const BACKLOG_S: f64 = 0.1;
 
 impl Wire<Vec<u8>> {
-    /// Sends over a serial line, which takes as long as its bytes.
+    /// Sends over a serial line; the time depends on the number of bytes.
     pub(crate) fn send_serially(&mut self, now: HostTime, bytes: &[u8]) {
         let free_at = self.free_at(now);
         if free_at.seconds_since(now) < BACKLOG_S {
@@ -76,7 +76,7 @@ impl Wire<Vec<u8>> {
         }
     }
 
-    /// Returns when a serial line has sent everything.
+    /// Returns the time at which a serial line has sent everything.
     pub(crate) fn free_at(&self, now: HostTime) -> HostTime {
         self.newest.max(now)
     }

@@ -1,9 +1,8 @@
-//! Faults of the network, on a virtual clock: minutes of traffic in seconds.
+//! Network faults on a virtual clock: minutes of traffic in seconds.
 //!
-//! The real transport of server and runtime, between a source of images without a renderer and a
-//! sink without a decoder, over a network in memory with seeded impairment. What each fault does is
-//! a table, `table.txt` beside this file; `VIZFLYT_FAULTS=write cargo test -p vizflyt-e2e
-//! --test tables faults` writes it anew.
+//! The real transport of server and runtime runs between an image source without renderer and a sink without decoder,
+//! over a network in memory with seeded impairment. `table.txt` next to this file lists the effect of each fault;
+//! `VIZFLYT_FAULTS=write cargo test -p vizflyt-e2e --test tables faults` rewrites it.
 
 mod memory;
 mod network;
@@ -18,7 +17,7 @@ use std::time::Duration;
 use table::{Case, Row, Script};
 use vizflyt_server::stream::transport::Congestion;
 
-/// Plays all cases, on all cores.
+/// Runs all cases, on all cores.
 fn play(cases: &[Case]) -> Vec<Row> {
     let next = AtomicUsize::new(0);
     let rows = Mutex::new(Vec::new());
@@ -40,7 +39,7 @@ fn play(cases: &[Case]) -> Vec<Row> {
 }
 
 #[test]
-fn the_table_of_faults() {
+fn effects_of_network_faults_match_the_table() {
     let cases = table::cases();
     let rows = play(&cases);
     let found = table::text(&rows);
@@ -51,7 +50,10 @@ fn the_table_of_faults() {
         assert!(row.events > 40, "{name}: events are sent");
         assert_eq!(row.backwards, 0, "{name}: images go backwards");
         if case.congestion == Congestion::Auto {
-            assert!(row.delivered >= 50.0, "{name}: what nobody chose delivers:\n{found}");
+            assert!(
+                row.delivered >= 50.0,
+                "{name}: the default congestion control delivers:\n{found}"
+            );
         }
         if case.path.loss == 0.05 && case.congestion == Congestion::Lan {
             assert!(row.delivered >= 99.0 && row.age_ms[1] <= 30.0, "{name}:\n{found}");
@@ -69,17 +71,18 @@ fn the_table_of_faults() {
     assert!(differences.is_empty(), "{}", differences.join("\n"));
 }
 
-/// Ten minutes at 100 Hz: tables of bounded size fill in the first minutes, then nothing grows.
+/// Ten minutes at 100 Hz: tables of bounded size fill in the first minutes, then the memory must stay constant.
 #[test]
-fn a_soak_leaves_memory_flat() {
+fn memory_stays_constant_over_ten_minutes() {
     let bytes = table::soak(Duration::from_mins(2), 5);
     println!("live bytes every two minutes: {bytes:?}");
     assert!(bytes[4] <= bytes[0] + BOUNDED_TABLES, "{bytes:?}");
     assert!(bytes[4] <= bytes[2] + UNDER_WAY, "{bytes:?}");
 }
 
-/// Samples of the clock filter, the rings of the stages' times, the log of events, whose entries hold why a flight
-/// ended: it doubles to its most, some 340 KB, in the first four minutes. [bytes]
+/// Memory of bounded tables: samples of the clock filter, ring buffers of the stages' times, and the event log, whose
+/// entries contain the end reason of a flight. The log grows by doubling, to about 340 KB in the first four minutes.
+/// [bytes]
 const BOUNDED_TABLES: usize = 384 << 10;
-/// Packets on their way differ from moment to moment; a byte per image would be 24 KB. [bytes]
+/// Variation by packets in transit; a leak of one byte per image would be 24 KB. [bytes]
 const UNDER_WAY: usize = 16 << 10;

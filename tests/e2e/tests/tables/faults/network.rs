@@ -1,4 +1,4 @@
-//! A network in memory: two directions of one path, each impaired as configured, by a seeded random generator.
+//! A network in memory: both directions of a path, impaired as configured by a seeded random generator.
 
 use std::collections::{HashMap, VecDeque};
 use std::fmt;
@@ -18,31 +18,31 @@ use vizflyt_protocol::random::SplitMix64;
 
 use super::world::{World, lock};
 
-/// What one direction does to packets.
+/// Impairment of one direction.
 #[derive(Clone, Debug)]
 pub(crate) struct Impairment {
-    /// Time from end to end. [s]
+    /// End-to-end delay.
     pub(crate) delay: Duration,
-    /// Added by chance, up to this; packets keep their order.
+    /// Maximum random additional delay; packets keep their order.
     pub(crate) jitter: Duration,
-    /// Share of packets lost, each by itself.
+    /// Fraction of lost packets, independent of each other.
     pub(crate) loss: f64,
-    /// Share of packets that come twice.
+    /// Fraction of duplicated packets.
     pub(crate) duplicate: f64,
-    /// Share of packets held back by [`HELD_BACK`], so that later ones overtake them.
+    /// Fraction of packets delayed by [`HELD_BACK`], so that later ones overtake them.
     pub(crate) reorder: f64,
-    /// Speed. [bit/s]
+    /// Bandwidth. [bit/s]
     pub(crate) bandwidth_bps: u64,
-    /// Bytes that wait for the bottleneck at most; more are lost.
+    /// Maximum queue at the bottleneck; further packets are lost. [bytes]
     pub(crate) queue: usize,
-    /// Largest IP packet; larger ones are lost, as where nothing answers.
+    /// Maximum size of an IP packet; larger ones are lost without a reply. [bytes]
     pub(crate) mtu: usize,
-    /// When nothing comes through, since the start.
+    /// Time ranges without any delivery, since the start.
     pub(crate) blackouts: Vec<Range<Duration>>,
 }
 
 impl Default for Impairment {
-    /// A gigabit cable through one switch.
+    /// Returns a gigabit cable with one switch.
     fn default() -> Self {
         Self {
             delay: Duration::from_micros(100),
@@ -58,28 +58,28 @@ impl Default for Impairment {
     }
 }
 
-/// How long a reordered packet waits.
+/// Delay of a reordered packet.
 pub(crate) const HELD_BACK: Duration = Duration::from_millis(2);
-/// Network cards gather packets that long before they wake the processor.
+/// Interval in which network cards collect packets before they interrupt the processor.
 const GATHER: Duration = Duration::from_micros(20);
-/// IPv4 and UDP.
+/// Size of IPv4 and UDP headers. [bytes]
 const HEADERS: usize = 28;
 
 /// One direction.
 struct Direction {
     does: Impairment,
     random: SplitMix64,
-    /// When the bottleneck has sent all it was given.
+    /// Time at which the bottleneck has sent everything.
     busy: Instant,
-    /// Arrival of the newest packet that kept its order.
+    /// Arrival of the newest packet that was not reordered.
     newest: Instant,
 }
 
 impl Direction {
-    /// Returns when a packet of `len` bytes arrives: never, once or twice.
+    /// Returns the arrival times of a packet of `len` bytes: none, one or two.
     fn arrivals(&mut self, start: Instant, now: Instant, len: usize) -> [Option<Instant>; 2] {
         let (does, random) = (&self.does, &mut self.random);
-        // Always as many draws, so that one setting does not change another's chances.
+        // A constant number of draws, so that one setting does not change the effect of another.
         let [lost, twice, late, jitter] = [(); 4].map(|()| random.unit());
         let len = len + HEADERS;
         let dark = does.blackouts.iter().any(|range| range.contains(&(now - start)));
@@ -115,7 +115,7 @@ pub(crate) struct Network {
 }
 
 impl Network {
-    /// Makes a network around the address of the server.
+    /// Creates a network with a server at this address.
     pub(crate) fn new(
         world: Arc<World>,
         seed: u64,
@@ -136,7 +136,7 @@ impl Network {
         Arc::new(Self { world, start, server, inboxes: Mutex::default(), down, up })
     }
 
-    /// Returns a socket; whatever had its address receives nothing any more.
+    /// Returns a socket; another socket with the same address no longer receives anything.
     pub(crate) fn socket(self: &Arc<Self>, address: SocketAddr) -> Arc<Socket> {
         let inbox = Arc::new(Inbox::default());
         lock(&self.inboxes).insert(address, inbox.clone());
@@ -167,7 +167,7 @@ struct Packet {
     bytes: Vec<u8>,
 }
 
-/// What has arrived at a socket.
+/// Packets that have arrived at a socket.
 #[derive(Default)]
 struct Inbox(Mutex<(VecDeque<Packet>, Option<Waker>)>);
 
@@ -189,15 +189,15 @@ pub(crate) struct Socket {
 }
 
 impl Socket {
-    /// Speaks from another address, as after a change of network or a rebound NAT; what is on
-    /// its way to the old one is lost.
+    /// Changes the address, as after a change of network or a rebound NAT. Packets in transit to the old address are
+    /// lost.
     pub(crate) fn move_to(&self, address: SocketAddr) {
         let mut inboxes = lock(&self.network.inboxes);
         inboxes.remove(&std::mem::replace(&mut *lock(&self.address), address));
         inboxes.insert(address, self.inbox.clone());
     }
 
-    /// Neither sends nor receives any more, as when its process is killed.
+    /// Stops sending and receiving, as if the process were killed.
     pub(crate) fn kill(&self) {
         let mut inboxes = lock(&self.network.inboxes);
         let address = *lock(&self.address);
@@ -269,7 +269,7 @@ impl AsyncUdpSocket for Socket {
     }
 }
 
-/// There is always room: what is too much, the path drops.
+/// Always writable: the path drops excess packets.
 #[derive(Debug)]
 struct Writable;
 

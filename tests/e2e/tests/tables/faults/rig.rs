@@ -1,4 +1,4 @@
-//! A server and a runtime, the real ones, over the network in memory; and what is noted there.
+//! The real server and runtime over the network in memory, with records of what arrives.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -37,25 +37,25 @@ use vizflyt_trust::{Client, Identity, KeysFolder, Owner, Paired, Role};
 use super::network::{Network, Socket};
 use super::world::lock;
 
-/// Makes a bitstream of 640x480 120 KB long. [mm]
+/// Depth noise that makes the bitstream of a 640x480 image 120 KB long. [mm]
 const DEPTH_NOISE_MM: f64 = 6.0;
-/// Different images of a level.
+/// Number of different images per level.
 const IMAGES: usize = 4;
-/// Where the server is.
+/// Address of the server.
 pub(crate) const SERVER: &str = "10.0.0.1:4433";
 
-/// What the images are.
+/// Image source.
 #[derive(Clone, Debug)]
 pub(crate) struct Source {
-    /// Images a second. [Hz]
+    /// Image rate. [Hz]
     pub(crate) rate_hz: u32,
-    /// Encoded images, [`IMAGES`] of each level of rate control, one after the other, again and again.
+    /// Encoded images, [`IMAGES`] for each level of rate control, sent in turn.
     pub(crate) payloads: Arc<Vec<Bytes>>,
-    /// Their size. [px]
+    /// Size of the images. [px]
     pub(crate) size_px: [u32; 2],
-    /// Time between events of the server.
+    /// Interval of the server's events.
     pub(crate) event_every: Duration,
-    /// What may be lowered on a slow link.
+    /// What rate control may reduce on a slow link.
     pub(crate) adapt: Adaptation,
 }
 
@@ -72,8 +72,7 @@ impl Source {
         }
     }
 
-    /// Returns images of 160x120 at 100 Hz, 8 KB each, and few events: the log of those grows, to a
-    /// bound.
+    /// Returns images of 160x120 at 100 Hz, 8 KB each, and few events, because the event log grows up to a limit.
     pub(crate) fn small() -> Self {
         let (size_px, event_every) = ([160, 120], Duration::from_secs(100));
         Self {
@@ -86,7 +85,7 @@ impl Source {
     }
 }
 
-/// Returns the width of images at a level of rate control: its share of the bytes is one of columns.
+/// Returns the image width at a level of rate control: the fraction of bytes is a fraction of columns.
 fn columns(width: u32, level: usize) -> u32 {
     (f64::from(width) * rate_control::level(level).share) as u32
 }
@@ -95,8 +94,7 @@ fn payloads([width, height]: [u32; 2]) -> Arc<Vec<Bytes>> {
     let mut random = SplitMix64::new(1);
     let payload = |level: usize| {
         let width = columns(width, level / IMAGES);
-        // Flat colour and noisy depth: integer coding alone, so that every machine makes the same
-        // number of bytes.
+        // Flat colour and noisy depth need only integer coding, so every machine produces the same number of bytes.
         let rgb = vec![128; (width * height * 3) as usize];
         let noise = |_| 2000 + (random.unit() * DEPTH_NOISE_MM) as u16;
         let depth_mm: Vec<u16> = (0..width * height).map(noise).collect();
@@ -108,24 +106,24 @@ fn payloads([width, height]: [u32; 2]) -> Arc<Vec<Bytes>> {
     Arc::new((0..rate_control::LEVELS.len() * IMAGES).map(payload).collect())
 }
 
-/// What came of it all.
+/// Records of a run.
 #[derive(Debug, Default)]
 pub(crate) struct Notes {
     /// Stamps of rendered images.
     pub(crate) rendered: Vec<ServerTime>,
-    /// Pose stamp and arrival of each image taken.
+    /// Pose stamp and arrival of each received image.
     pub(crate) images: Vec<(ServerTime, ServerTime)>,
-    /// Age of each pose on its arrival. [s]
+    /// Age of each pose at its arrival. [s]
     pub(crate) poses_s: Vec<f64>,
-    /// By process of the runtime: how often each event of the server came, by its number.
+    /// For each process of the runtime: number of arrivals of each server event, by event number.
     pub(crate) events_down: Vec<BTreeMap<u32, u32>>,
-    /// The same of the runtime's events, by all processes of the server.
+    /// Number of arrivals of each runtime event, over all processes of the server.
     pub(crate) events_up: BTreeMap<u32, u32>,
-    /// Events sent by the server.
+    /// Number of events sent by the server.
     pub(crate) told_down: u32,
-    /// Events sent by the runtime.
+    /// Number of events sent by the runtime.
     pub(crate) told_up: u32,
-    /// Times that the runtime lost its connection.
+    /// Reasons for which the runtime lost its connection.
     pub(crate) downs: Vec<String>,
 }
 
@@ -136,7 +134,7 @@ pub(crate) struct Server {
     tasks: Vec<JoinHandle<()>>,
 }
 
-/// The keys of both, paired; a restart keeps them.
+/// Paired keys of server and runtime; they survive restarts.
 pub(crate) struct Keys {
     folder: KeysFolder,
     runtime: Identity,
@@ -144,7 +142,7 @@ pub(crate) struct Keys {
 }
 
 impl Keys {
-    /// Makes them.
+    /// Creates and pairs the keys.
     pub(crate) fn make() -> Self {
         let root = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
@@ -165,7 +163,7 @@ impl Keys {
 }
 
 impl Server {
-    /// Starts it.
+    /// Starts the server.
     pub(crate) fn start(
         network: &Arc<Network>,
         keys: &Keys,
@@ -209,7 +207,7 @@ impl Server {
         Self { rooms, socket, tasks }
     }
 
-    /// Ends it as SIGKILL does: without a word.
+    /// Ends the server like SIGKILL, without a message.
     pub(crate) fn kill(&self, notes: &Mutex<Notes>) {
         self.note_events(notes);
         self.socket.kill();
@@ -218,7 +216,7 @@ impl Server {
         }
     }
 
-    /// Notes how often each event of the runtime came.
+    /// Records how often each event of the runtime arrived.
     pub(crate) fn note_events(&self, notes: &Mutex<Notes>) {
         let mut cursor = 0;
         let found = self.rooms.flights.vehicles[0].events.read(&mut cursor).unwrap();
@@ -236,13 +234,12 @@ fn seeded(mut config: EndpointConfig, seed: u8) -> EndpointConfig {
     config
 }
 
-/// Renders and hands out images as the render and encode threads do: newest wins, none while K are
-/// in flight.
+/// Renders and sends images like the render and encode threads: the newest image wins, none while K are in flight.
 async fn render(rooms: Rooms, source: Source, notes: Arc<Mutex<Notes>>) {
     let period = Duration::from_secs(1) / source.rate_hz;
     let mut due = Instant::now();
     let (mut seq, mut newest, mut broadcast) = (0, None, Broadcast::default());
-    // The encode thread waits on a condition; here it looks every millisecond.
+    // The encode thread waits for a condition; this task polls every millisecond.
     let mut look = interval(Duration::from_millis(1));
     look.set_missed_tick_behavior(MissedTickBehavior::Skip);
     loop {
@@ -275,7 +272,7 @@ async fn render(rooms: Rooms, source: Source, notes: Arc<Mutex<Notes>>) {
     }
 }
 
-/// Poses, 200 Hz.
+/// Sends poses at 200 Hz.
 async fn localize(rooms: Rooms) {
     let mut tick = interval(Duration::from_millis(5));
     loop {
@@ -285,7 +282,7 @@ async fn localize(rooms: Rooms) {
     }
 }
 
-/// Events, from when the first runtime has come: what was before a flight concerns nobody.
+/// Sends events from the first connection of a runtime on: earlier events are not delivered.
 async fn happen(rooms: Rooms, source: Source, notes: Arc<Mutex<Notes>>) {
     let mut tick = interval(source.event_every);
     let mut flown = false;
@@ -319,7 +316,7 @@ pub(crate) struct Runtime {
 }
 
 impl Runtime {
-    /// Starts it at an address; each new connection speaks from the next port.
+    /// Starts the runtime at an address; each new connection uses the next port.
     pub(crate) fn start(
         network: &Arc<Network>,
         keys: &Keys,
@@ -381,14 +378,14 @@ impl Runtime {
         Self { socket, tasks }
     }
 
-    /// Speaks from another address from now on.
+    /// Changes the address.
     pub(crate) fn move_to(&self, address: SocketAddr) {
         if let Some(socket) = &*lock(&self.socket) {
             socket.move_to(address);
         }
     }
 
-    /// Ends it as SIGKILL does: without a word.
+    /// Ends the runtime like SIGKILL, without a message.
     pub(crate) fn kill(&self) {
         if let Some(socket) = &*lock(&self.socket) {
             socket.kill();
@@ -399,7 +396,7 @@ impl Runtime {
     }
 }
 
-/// Takes images as the decoder does.
+/// Takes images like the decoder.
 async fn take(shared: Shared, notes: Arc<Mutex<Notes>>) {
     let mut look = interval(Duration::from_millis(1));
     let mut rendered = ServerTime::ZERO;
@@ -407,7 +404,7 @@ async fn take(shared: Shared, notes: Arc<Mutex<Notes>>) {
         look.tick().await;
         while let Some((_, step)) = shared.mailbox.next(Duration::ZERO, |_| true) {
             match step {
-                // As the decoder does with what was overtaken on its way.
+                // The decoder drops images that a newer one has overtaken.
                 DecodeStep::Begin(arrival) if arrival.header.pose_stamp() <= rendered => {
                     shared.mailbox.give_up(0);
                 }
@@ -423,7 +420,7 @@ async fn take(shared: Shared, notes: Arc<Mutex<Notes>>) {
     }
 }
 
-/// Telemetry at 10 Hz, an event every 700 ms.
+/// Sends telemetry at 10 Hz and an event every 700 ms.
 async fn report(outbox: Arc<Outbox>, notes: Arc<Mutex<Notes>>) {
     let mut tick = interval(Duration::from_millis(100));
     for count in 0_u64.. {

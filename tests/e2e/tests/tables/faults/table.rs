@@ -1,4 +1,4 @@
-//! What each fault does to the stream: one row per case.
+//! Table of the faults' effects on the stream, one row per case.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -16,61 +16,61 @@ use super::network::{Impairment, Network};
 use super::rig::{Keys, Notes, Runtime, SERVER, Server, Source};
 use super::world::{World, lock};
 
-/// One case.
+/// A case of the table.
 #[derive(Clone)]
 pub(crate) struct Case {
     pub(crate) name: String,
     pub(crate) congestion: Congestion,
-    /// The runtime's address.
+    /// Address of the runtime.
     host: &'static str,
-    /// The same both ways.
+    /// Impairment of both directions.
     pub(crate) path: Impairment,
     pub(crate) script: Script,
     pub(crate) source: Source,
 }
 
-/// What happens besides.
+/// Additional fault of a case.
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) enum Script {
-    /// Nothing.
+    /// No additional fault.
     Nothing,
-    /// Nothing comes through for two seconds.
+    /// No packet arrives for two seconds.
     Blackout,
-    /// The server is killed, and started again a second later.
+    /// The server is killed, and restarts a second later.
     ServerRestart,
-    /// The runtime is killed, and started again half a second later.
+    /// The runtime is killed, and restarts half a second later.
     RuntimeRestart,
-    /// The runtime speaks from another address.
+    /// The runtime changes its address.
     Move,
 }
 
-/// One row.
+/// A row of the table.
 pub(crate) struct Row {
     pub(crate) name: String,
-    /// Images that came, of those rendered while a server ran. [%]
+    /// Fraction of the images rendered by a running server that arrived. [%]
     pub(crate) delivered: f64,
-    /// Drawn to received. [ms]
+    /// Image age from rendering to reception, p50 and p99. [ms]
     pub(crate) age_ms: [f64; 2],
-    /// From the fault's end to an image rendered after it. [ms]
+    /// Time from the end of the fault to the arrival of an image rendered after it. [ms]
     pub(crate) newest_ms: Option<f64>,
     /// Age of poses. [ms]
     pub(crate) pose_ms_p99: f64,
-    /// Longest time without an image, but for the fault. [ms]
+    /// Longest time without an image. [ms]
     pub(crate) gap_ms: f64,
     pub(crate) events: u32,
     pub(crate) lost: u32,
     pub(crate) doubled: u32,
-    /// Images that came after a newer one.
+    /// Images that arrived after a newer one.
     pub(crate) backwards: u32,
 }
 
-/// Virtual seconds of each case.
+/// Virtual duration of a case.
 pub(crate) const LASTS: Duration = Duration::from_secs(14);
-/// When the fault begins.
+/// Start of the fault.
 const FAULT: Duration = Duration::from_secs(5);
 
 impl Case {
-    /// Plays it.
+    /// Runs the case.
     pub(crate) fn play(&self) -> Row {
         let notes = Arc::new(Mutex::new(Notes::default()));
         let noted = notes.clone();
@@ -79,7 +79,7 @@ impl Case {
         self.row(notes, fault)
     }
 
-    /// Returns when the fault began and ended, on the server's clock.
+    /// Runs the scenario; returns start and end of the fault on the server's clock.
     async fn act(&self, world: Arc<World>, notes: Arc<Mutex<Notes>>) -> [ServerTime; 2] {
         let start = Instant::now();
         let stamp = clock::now();
@@ -134,7 +134,7 @@ impl Case {
         };
         let newest = notes.images.iter().find(|(rendered, _)| *rendered >= back);
         let gaps = notes.images.windows(2).map(|pair| pair[1].1.seconds_since(pair[0].1) * 1e3);
-        // The newest may still be on its way at the end.
+        // The newest events may still be in transit at the end.
         let events = |sent: u32| sent.saturating_sub(2);
         let (down, up) = (&notes.events_down, &notes.events_up);
         let came = |n: &u32| down.iter().any(|process| process.contains_key(n));
@@ -158,7 +158,7 @@ impl Case {
     }
 }
 
-/// Returns the table as text.
+/// Formats the table.
 pub(crate) fn text(rows: &[Row]) -> String {
     let mut out = format!(
         "{:<36}{:>10}{:>9}{:>9}{:>9}{:>9}{:>10}{:>7}\n{:<36}{:>10}{:>9}{:>9}{:>9}{:>9}{:>10}{:>7}\n",
@@ -199,10 +199,10 @@ pub(crate) fn text(rows: &[Row]) -> String {
     out
 }
 
-/// Returns what differs by more than chance from the committed table.
+/// Returns significant differences from the committed table.
 ///
-/// Cases without loss are the same to the last digit in every run; with loss, tokio's `select!`
-/// draws lots which of two ready things is done first, and so which packet is lost.
+/// Cases without loss are identical in every run. With loss, tokio's `select!` chooses randomly between two ready
+/// branches, which changes the lost packets.
 pub(crate) fn differences(found: &str, committed: &str) -> Vec<String> {
     let mut differences = Vec::new();
     if found.lines().count() != committed.lines().count() {
@@ -223,7 +223,7 @@ pub(crate) fn differences(found: &str, committed: &str) -> Vec<String> {
                 let allowed = match index {
                     0 => 4.0,
                     6 => 0.0,
-                    // A gap is the worst of a thousand.
+                    // A gap is the maximum of a thousand values.
                     4 => 10.0 + 0.5 * expected,
                     _ => 3.0 + 0.25 * expected,
                 };
@@ -243,7 +243,7 @@ pub(crate) fn differences(found: &str, committed: &str) -> Vec<String> {
 
 const NAME_WIDTH: usize = 36;
 
-/// Streams small images over a cable; returns the bytes that live after each of `times` spans.
+/// Streams small images over a cable; returns the allocated bytes after each of `times` spans.
 pub(crate) fn soak(span: Duration, times: u32) -> Vec<usize> {
     World::run(|world| async move {
         let notes = Arc::new(Mutex::new(Notes::default()));
@@ -259,7 +259,7 @@ pub(crate) fn soak(span: Duration, times: u32) -> Vec<usize> {
             let mut notes = lock(&notes);
             let due = span.as_secs() as usize * source.rate_hz as usize;
             assert!(notes.images.len() > due * 99 / 100, "{} of {due}", notes.images.len());
-            // What the test itself notes does not count.
+            // Reset the test's own records, so that they do not count.
             let down = notes.events_down.len();
             *notes = Notes { events_down: vec![BTreeMap::new(); down], ..Notes::default() };
             live.push(memory::live().max(0) as usize);
@@ -272,7 +272,7 @@ fn ms(ms: u64) -> Duration {
     Duration::from_millis(ms)
 }
 
-/// An address of the lab's own network, and a public one (TEST-NET-3, RFC 5737).
+/// A private address, and a public one (TEST-NET-3, RFC 5737).
 const NEAR: &str = "10.0.0.2";
 const PUBLIC: &str = "203.0.113.2";
 

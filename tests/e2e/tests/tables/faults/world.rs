@@ -1,9 +1,9 @@
-//! Virtual time: minutes pass in seconds, to the nanosecond, and the same in every run.
+//! Virtual time: minutes pass in seconds, with nanosecond resolution, identical in every run.
 //!
-//! Tokio's held clock jumps to the next timer when every task waits, but its timers are of whole
-//! milliseconds; a packet takes less than one. So a conductor keeps what happens in between: when
-//! every task waits, which tokio shows by parking, it moves the clock to the next timed event, or
-//! to the next whole millisecond, where tokio's own timers go on.
+//! Tokio's paused clock jumps to the next timer when every task waits, but its timers have a resolution of one
+//! millisecond, and a packet takes less. Therefore a conductor keeps the events in between. When every task waits
+//! (tokio parks the thread), it advances the clock to the next timed event, or to the next whole millisecond, where
+//! tokio's own timers continue.
 
 use std::collections::BTreeMap;
 use std::future::Future;
@@ -16,10 +16,10 @@ use tokio::time::{Instant, advance, sleep_until};
 
 type TimedEvent = Box<dyn FnOnce() + Send>;
 
-/// The clock and what is due.
+/// The clock and the planned events.
 #[derive(Default)]
 pub(crate) struct World {
-    /// By time, and in the order of being planned.
+    /// Events by time, then by order of planning.
     planned: Mutex<BTreeMap<(Instant, u64), TimedEvent>>,
     count: Mutex<u64>,
     sooner: Notify,
@@ -28,7 +28,7 @@ pub(crate) struct World {
 }
 
 impl World {
-    /// Runs what `play` makes of a new world, to its end.
+    /// Runs the future that `play` returns for a new world, to its end.
     pub(crate) fn run<F: Future>(play: impl FnOnce(Arc<World>) -> F) -> F::Output {
         let world = Arc::new(World::default());
         let parked = world.clone();
@@ -44,8 +44,8 @@ impl World {
             .unwrap();
         runtime.block_on(async {
             let start = Instant::now();
-            // Stamps go over the wire in as many bytes as they need: every run starts on one of
-            // a length that lasts for two years from the machine's start.
+            // Stamps are encoded with variable length. Every run starts at a length that stays constant until two years
+            // after the machine's start.
             let stamp_ns = vizflyt_server::clock::now().as_ns();
             let whole_ms = (stamp_ns.next_multiple_of(START_NS) - stamp_ns).div_ceil(1_000_000);
             advance(Duration::from_millis(whole_ms)).await;
@@ -54,7 +54,7 @@ impl World {
         })
     }
 
-    /// Does something at `at`.
+    /// Plans an event at a time.
     pub(crate) fn plan(&self, at: Instant, what: impl FnOnce() + Send + 'static) {
         let mut planned = lock(&self.planned);
         let mut count = lock(&self.count);
@@ -85,7 +85,7 @@ impl World {
             if near || !into_ms.is_zero() {
                 self.waits.store(true, Ordering::Relaxed);
                 self.idle.notified().await;
-                // What is due may have changed while the others came to rest.
+                // The next event may have changed while the other tasks came to rest.
                 let boundary = now - into_ms + MS;
                 advance(self.next().map_or(boundary, |at| at.min(boundary)) - now).await;
             } else if let Some(at) = next {
@@ -102,14 +102,14 @@ impl World {
     }
 }
 
-/// Locks; nothing here panics with a lock held but a failing test.
+/// Locks a mutex; only a failing test can poison it.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap()
 }
 
 const MS: Duration = Duration::from_millis(1);
 const MS_NS: u64 = 1_000_000;
-/// 13 days: from here on stamps have 8 bytes as varints, up to 2^56 ns.
+/// 13 days: from here to 2^56 ns, stamps have 8 bytes as varints.
 const START_NS: u64 = 1 << 50;
 
 #[cfg(test)]
@@ -117,7 +117,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn things_happen_in_order_at_their_time_between_tokios_timers() {
+    fn events_happen_in_order_and_on_time_between_tokios_timers() {
         let log = Arc::new(Mutex::new(Vec::new()));
         let seen = log.clone();
         World::run(|world| async move {
@@ -128,7 +128,7 @@ mod tests {
                 world.plan(us(at), move || {
                     lock(&seen).push((Instant::now() - start).as_micros());
                     if at == 1_250 {
-                        // Planned by what happens, for earlier than all else.
+                        // Planned by another event, before all others.
                         let seen = seen.clone();
                         world_too.plan(us(1_260), move || lock(&seen).push(1_260));
                     }

@@ -1,4 +1,4 @@
-//! The sort alone, many times: a race shows as a result that differs from run to run.
+//! Tests of the sort only, repeated many times: a race appears as results that differ between runs.
 
 use zerocopy::{FromBytes, IntoBytes};
 
@@ -7,7 +7,7 @@ use super::super::super::device::Adapter;
 use super::super::{SLOTS, VISIBLE};
 use super::*;
 
-/// What a sort of up to `room` pairs takes.
+/// Buffers and kernels for sorting up to `capacity` pairs.
 struct Bench {
     device: Device,
     sort: Sort,
@@ -45,7 +45,7 @@ impl Bench {
         })
     }
 
-    /// Sorts on the device by so many bits; returns keys and values. Values are the keys' indices.
+    /// Sorts on the device by `bits` bits; returns keys and values. Values are the indices of the keys.
     fn sorted(&self, keys: &[u32], bits: u32, makes_values: bool) -> (Vec<u32>, Vec<u32>) {
         let Device { device, queue, .. } = &self.device;
         let kept = keys.iter().filter(|&&key| !makes_values || key != u32::MAX).count();
@@ -93,7 +93,7 @@ impl Bench {
     }
 }
 
-/// The plain truth: std's stable sort by the same bits.
+/// Reference: stable sort of the standard library by the same bits.
 fn expected(keys: &[u32], bits: u32, makes_values: bool) -> (Vec<u32>, Vec<u32>) {
     let kept = |&i: &u32| !makes_values || keys[i as usize] != u32::MAX;
     let mut order: Vec<u32> = (0..keys.len() as u32).filter(kept).collect();
@@ -114,7 +114,7 @@ fn random_keys(count: usize, seed: u64, mask: u32) -> Vec<u32> {
 }
 
 #[test]
-fn a_hundred_thousand_keys_a_hundred_times() {
+fn sorts_a_hundred_thousand_keys_a_hundred_times() {
     let Some(bench) = Bench::new(100_000) else { return };
     let keys = random_keys(100_000, 1, u32::MAX);
     let truth = expected(&keys, 32, true);
@@ -124,9 +124,9 @@ fn a_hundred_thousand_keys_a_hundred_times() {
 }
 
 #[test]
-fn a_million_keys_a_few_times() {
+fn sorts_a_million_keys_repeatedly() {
     let Some(bench) = Bench::new(1_000_000) else { return };
-    // Depths from 0.2 m to 50 m, as they come; and tiles with many equal keys, in their order.
+    // Depths from 0.2 m to 50 m in random order, and tiles with many equal keys, which must keep their order.
     let depths: Vec<u32> = random_keys(1_000_000, 2, u32::MAX)
         .into_iter()
         .map(|key| (0.2 + key as f32 / u32::MAX as f32 * 49.8).to_bits())
@@ -140,7 +140,7 @@ fn a_million_keys_a_few_times() {
 }
 
 #[test]
-fn every_count_and_pattern_is_sorted() {
+fn sorts_every_count_and_pattern() {
     let Some(bench) = Bench::new(20_000) else { return };
     let check = |keys: &[u32], bits: u32, makes_values: bool| {
         let (count, truth) = (keys.len(), expected(keys, bits, makes_values));
@@ -160,7 +160,7 @@ fn every_count_and_pattern_is_sorted() {
     check(&vec![u32::MAX; count], 32, true);
     check(&(0..count as u32).collect::<Vec<_>>(), 32, true);
     check(&(0..count as u32).rev().collect::<Vec<_>>(), 24, false);
-    // Half of the slots are empty, as where half of a block is in view.
+    // Half of the slots are empty, as in a block that is half in view.
     let mut sparse = random_keys(count, 6, u32::MAX >> 1);
     sparse.iter_mut().step_by(2).for_each(|key| *key = u32::MAX);
     check(&sparse, 32, true);
