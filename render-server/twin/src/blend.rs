@@ -1,14 +1,13 @@
-//! Pass 3: tiles of flat Gaussians to pixels, and what a loss feels at the pixels back to them.
+//! Pass 3: blends tiles of projected Gaussians to pixels, and propagates the loss gradient at the pixels back to them.
 //!
-//! A tile is cut into blocks as wide as 8 pixels and as high as a vector has room for. A batch of a
-//! tile's list is copied next to each other, and per Gaussian a mask says which blocks its ellipse
-//! reaches. Forward, blocks keep their pixels in registers while their part of the batch passes.
-//! Backward, a Gaussian keeps its sums in registers while its blocks pass; it goes from near to far
-//! as forward does, so that transmittances come out as they did, bit by bit, and carries what is
-//! still to come behind, `sum_(j > i) w_j q_j`, by subtraction.
+//! A tile consists of blocks 8 pixels wide; their height follows from the vector length. A batch of a tile's list is
+//! copied to contiguous memory, with a mask of the blocks that each Gaussian's ellipse overlaps. The forward pass keeps
+//! the pixels of a block in registers. The backward pass keeps the sums of a Gaussian in registers. Both go from near to
+//! far, so that transmittances are bit-identical; the contribution from behind, `sum_(j > i) w_j q_j`, is obtained by
+//! subtraction.
 //!
-//! Channels forward: red, green, blue, `sum w z`, `sum w z^2`, transmittance. Channels backward: the
-//! derivative of the loss by each of them.
+//! Forward channels: red, green, blue, `sum w z`, `sum w z^2`, transmittance. Backward channels: derivatives of the loss
+//! by each of them.
 
 use vizflyt_splat::limits::{ALPHA_MAX, TRANSMITTANCE_MIN};
 use vizflyt_splat::simd::{Kernel, Simd};
@@ -19,15 +18,15 @@ use crate::project::{Flat, FlatGradient, MIN_LEVEL};
 
 /// Channels of an image.
 pub(crate) const CHANNELS: usize = 6;
-/// Channels of its derivative: one more, how wrong a pixel is.
+/// Channels of its derivative: those of an image, and the error of the pixel.
 pub(crate) const BY_CHANNELS: usize = 7;
 const PIXELS: usize = TILE * TILE;
 const BLOCK_WIDTH: usize = 8;
-/// Of eight lanes: as many as a mask has bits.
+/// Maximum number of blocks, with 8 lanes: the bits of a mask.
 const MAX_BLOCKS: usize = PIXELS / 8;
 const BATCH: usize = 64;
 
-/// What a tile's pixels add up for one Gaussian: `sum G`, `G u`, `G dy`, `G u^2`, `G u dy`, `G dy^2`
+/// Sums over a tile's pixels for one Gaussian: `sum G`, `G u`, `G dy`, `G u^2`, `G u dy`, `G dy^2`
 /// with `G` the derivative by its level (without ln 2), then the derivatives by colour and z,
 /// then the error seen through it.
 pub(crate) type PairSums = [f32; SUMS];
@@ -49,7 +48,7 @@ pub(crate) fn flat_gradient(flat: &Flat, sums: &PairSums) -> FlatGradient {
     }
 }
 
-/// Some Gaussians of a tile, column by column; means from the tile's corner.
+/// Batch of Gaussians of a tile, as columns; means relative to the tile's corner [px].
 struct Batch {
     mean_x: [f32; BATCH],
     mean_y: [f32; BATCH],
@@ -61,7 +60,7 @@ struct Batch {
     extent_y: [f32; BATCH],
     z: [f32; BATCH],
     rgb: [[f32; BATCH]; 3],
-    /// Blocks that each reaches.
+    /// Blocks that each Gaussian overlaps.
     masks: [u32; BATCH],
 }
 
