@@ -51,7 +51,9 @@ impl SensorInfo {
         let kind =
             SensorKind::ALL.into_iter().find(|known| known.name() == kind).ok_or_else(|| {
                 let known = SensorKind::ALL.map(SensorKind::name).join(", ");
-                PyValueError::new_err(format!("unknown kind of sensor {kind:?}; known kinds: {known}"))
+                PyValueError::new_err(format!(
+                    "unknown kind of sensor {kind:?}; known kinds: {known}"
+                ))
             })?;
         Ok(Self(SdkSensorInfo {
             name: bounded(name),
