@@ -17,7 +17,7 @@ pytest.importorskip("torch", reason="RLlib learns by PyTorch: pip install torch"
 # Deprecations within Ray and its dependencies do not matter here.
 pytestmark = pytest.mark.filterwarnings("ignore")
 
-import ray # noqa: E402, after the check that it is installed
+import ray  # noqa: E402, after the check that it is installed
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "learn_ray.py"
 
