@@ -28,7 +28,10 @@ def of(output: str, passed: bool) -> Counts:
     """Returns the tests in a stage's output; a stage whose tools print no counts is one test."""
     counts = Counts()
     for line in output.splitlines():
-        counts += of_line(re.sub(r"\x1b\[[0-9;]*m", "", line).strip())
+        plain = re.sub(r"\x1b\[[0-9;]*m", "", line)
+        # Output of a failed test in nextest, which counts the test in its summary.
+        if not re.match(r"\s+test result:", plain):
+            counts += of_line(plain.strip())
     if counts.passed + counts.failed == 0:
         counts.passed += passed
     # A tool may fail outside its tests.

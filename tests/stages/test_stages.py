@@ -41,6 +41,13 @@ class Counts(unittest.TestCase):
         self.assertEqual(counts.of("nothing", passed=True), counts.Counts(1, 0, 0))
         self.assertEqual(counts.of("nothing", passed=False), counts.Counts(0, 1, 0))
 
+    def test_a_failed_test_of_nextest_counts_once(self) -> None:
+        output = (
+            "    test result: FAILED. 0 passed; 1 failed; 0 ignored\n"
+            "  Summary [ 3.2s] 3 tests run: 2 passed, 1 failed, 0 skipped"
+        )
+        self.assertEqual(counts.of(output, passed=False), counts.Counts(2, 1, 0))
+
     def test_a_stage_that_fails_after_its_tests_counts_as_failed(self) -> None:
         output = "test result: ok. 2 passed; 0 failed; 0 ignored; 0 measured; 0 filtered out"
         self.assertEqual(counts.of(output, passed=False), counts.Counts(2, 1, 0))
