@@ -37,8 +37,8 @@ fn trial(flash: &'static Flash) -> Trial<Region> {
     Trial::new(settings, base)
 }
 
-/// Counts this start of a firmware on trial, and rolls back after its last start. Call it before anything that may
-/// fail. Returns whether this firmware is on trial.
+/// Counts a start of this firmware, if it is on trial. If it has used all its starts, switches to the previous
+/// firmware and restarts. Call it before anything that may fail. Returns whether this firmware is on trial.
 pub(crate) fn start(flash: &'static Flash) -> bool {
     match trial(flash).start() {
         Ok(StartAction::OnTrial) => true,

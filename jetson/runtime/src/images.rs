@@ -79,7 +79,7 @@ struct Lane {
     pieces: Vec<Vec<u8>>,
     /// Number of decoded pieces.
     decoded: usize,
-    /// Id of the memory that contains the decoded pieces.
+    /// Id of the loaned memory block that contains the decoded pieces.
     home: u64,
     info: Option<Info>,
     /// Tick of the newest decoded image, and stamp of its pose.

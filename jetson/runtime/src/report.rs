@@ -33,7 +33,7 @@ pub struct FlightReport {
     pub age_ms_p99: f64,
     /// Time inside the plugin's `on_image`, median. [ms]
     pub plugin_ms_p50: f64,
-    /// Contribution of each stage to the age. [ms]
+    /// Duration of each stage, from the pose stamp to the setpoint. [ms]
     pub stages: Stages<StageTimes>,
     /// Pose stamp to plugin callback. [ms]
     pub age: StageTimes,

@@ -207,10 +207,11 @@ pub struct StageConfig {
     pub normal: DVec3,
     /// Horizontal width of the opening; at least the body's. [m]
     pub width_m: f64,
-    /// Height of the opening, across width and normal; at least the body's. [m]
+    /// Height of the opening, perpendicular to width and normal; at least the body's. [m]
     pub height_m: f64,
-    /// Corners of the opening, 3 to 128, within width and height: to the left and up from the centre, seen in
-    /// the direction of passage. Without corners, the opening is the rectangle. [m]
+    /// Corners of the opening, 3 to 128, within width and height. Seen in the direction of passage, x is the
+    /// distance to the left of the centre, y the distance above it. Without corners, the opening is the
+    /// rectangle. [m]
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub polygon_m: Vec<DVec2>,
     /// Depth of the opening along the direction of passage, centred on `center_m`. The passage counts when the

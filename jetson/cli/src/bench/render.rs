@@ -96,7 +96,7 @@ struct Figures {
     /// Results with light and weather, if requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     environment: Option<EnvironmentFigures>,
-    /// Mean over the last image of each camera.
+    /// Workload of the renderer for one image: mean over the last image of each camera.
     workload: Work,
 }
 

@@ -33,7 +33,7 @@ pub(crate) struct LabReport {
     pub age_ms_p99: f64,
     /// Time to render all cameras of a tick, median. [ms]
     pub render_ms_p50: f64,
-    /// Contribution of each stage to the age, by name, as `p50`, `p90`, `p99`, `max`. [ms]
+    /// Duration of each stage from the pose stamp to the setpoint, by name, as `p50`, `p90`, `p99`, `max`. [ms]
     pub stages: Value,
     /// Age of images, with the same statistics. [ms]
     pub age: Value,

@@ -267,7 +267,7 @@ impl Race {
 
 /// Maximum number of images without depth: 1 s. A covered camera has none for a while.
 const PATIENCE: u32 = 30;
-/// Maximum time step; a longer one counts as a gap between images. [s]
+/// Maximum time step between two images; a longer one is clamped to this value. [s]
 const MAX_DT_S: f64 = 0.1;
 /// Maximum speed in all directions. [m/s]
 const MAX_MPS: f64 = 1.3;

@@ -63,7 +63,7 @@ impl Flight {
         self.server_down = Some(bounded(why));
     }
 
-    /// Ends the flight because the server rejects us permanently; `why` is a sentence.
+    /// Ends the flight because the connection to the server failed permanently; `why` is a sentence.
     pub fn refuse(&mut self, now: HostTime, why: &str) {
         self.end_for(now, EndReason::ServerRefused(bounded(why)));
     }

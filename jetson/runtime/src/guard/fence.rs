@@ -212,13 +212,12 @@ impl Fence {
         stopping.most_mps(wanted_mps, free_m, flown_mps, a_mps2)
     }
 
-    /// Returns `v_mps` with every component reduced that does not lead away from the nearest limit, until the vehicle
-    /// stops in time.
+    /// Returns `v_mps`, slowed until the vehicle can stop before all limits. The component away from the nearest limit
+    /// is kept; one factor reduces the rest. [m/s, world]
     ///
-    /// [`Self::towards_faces`] treats each face separately. Velocity changes and acceleration along a face reduce the
-    /// capability to stop before it, and a plugin may request more of them after the stop command. Therefore this
-    /// function simulates the whole stop with the vehicle's full capability. Half of the margin is left for the errors
-    /// of this model. [m/s, world]
+    /// [`Self::towards_faces`] treats each face separately. Acceleration along a face is not available for the stop
+    /// before it, and a plugin may request more of it after the stop command. Therefore this function simulates the
+    /// whole stop with the vehicle's full acceleration. Half of the margin is left for the errors of this model.
     fn leave_for_stopping(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
         let stopping = Stopping::new(vehicle.response, self.max_mps2, WHOLE_SHARE);
         let (flown_mps, a_mps2) = (vehicle.v_mps.length(), vehicle.a_mps2.length());

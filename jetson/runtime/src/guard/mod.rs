@@ -166,7 +166,8 @@ pub const UNSURE_SIGMAS: f64 = 3.0;
 pub const SETPOINT_HOLD_S: f64 = 0.5;
 /// Land without a setpoint for this long. [s]
 pub const SETPOINT_LAND_S: f64 = 2.0;
-/// Maximum time from a plugin's restart to its first setpoint: an interpreter that loads numpy and a small model. [s]
+/// Maximum time from a plugin's restart to its first setpoint. Python needs some seconds to load numpy and a small
+/// model. [s]
 pub const RESTART_WITHIN_S: f64 = 10.0;
 
 /// Maximum age of the plugin's images at full speed: four images of a 30 Hz camera. Beyond it, the speed limit falls as

@@ -14,7 +14,7 @@ const SHARE: f64 = 0.01;
 /// Distance in which the direction turns to the next random angle. [m]
 const TURN_M: f64 = 3.0;
 
-/// Drift of the position in force.
+/// Simulated drift of the position that the plugin has set.
 #[derive(Clone, Debug)]
 pub(super) struct Slip {
     /// Different for each flight.
@@ -44,7 +44,7 @@ impl Slip {
         self.slip_m = DVec3::ZERO;
     }
 
-    /// Returns the drift of the position in force. [m, world]
+    /// Returns the drift since the plugin set the position. [m, world]
     pub(super) fn slip_m(&self) -> DVec3 {
         self.slip_m
     }

@@ -111,7 +111,7 @@ impl Guard {
         p_m
     }
 
-    /// Returns the drift of the position in force. [m, world]
+    /// Returns the simulated drift that is added to the plugin's position; zero if the course has none. [m, world]
     fn slip_m(&self) -> DVec3 {
         self.request.slip.as_ref().map_or(DVec3::ZERO, Slip::slip_m)
     }

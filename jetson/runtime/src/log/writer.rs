@@ -284,7 +284,8 @@ impl<D: Disk> LogWriter<D> {
         ));
     }
 
-    /// Checks the free disk space and reports drops, once a second.
+    /// Stops logging images while the disk is almost full, warns if images or records were dropped, and
+    /// logs the status. Called once a second.
     pub(super) fn check_health(&mut self) -> McapResult<()> {
         let free = if self.sinks.file.is_some() { (self.free_bytes)() } else { None };
         let fit = images_fit(self.images_fit, free);

@@ -44,8 +44,8 @@ pub struct PluginLimits {
     pub read: Vec<PathBuf>,
     /// Folder in which the plugin starts. Default: the working folder.
     pub folder: Option<PathBuf>,
-    /// Whether the plugin is graded: its own folder is read-only, the working folder is hidden, its files are deleted
-    /// at its end, and its environment has only the variables that programs need.
+    /// Whether the plugin is graded: the plugin's folder is read-only, the working folder is hidden, its scratch
+    /// files are deleted when it ends, and its environment has only the variables that programs need.
     pub graded: bool,
     /// Map passed to the plugin as JSON, if the course's map is known.
     pub map: Option<String>,

@@ -77,7 +77,7 @@ pub enum EndReason {
     },
     /// An earlier runtime left the vehicle in the air.
     LeftInAir,
-    /// The server, or a connection between server and plugin, refused; with its message.
+    /// The connection to the server failed permanently; the text gives the reason.
     ServerRefused(Text),
     /// The arena is invalid for a flight; the text names the value and the reason.
     ArenaRefused(Text),

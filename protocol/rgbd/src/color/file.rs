@@ -12,7 +12,7 @@ use crate::header::{
 };
 use zerocopy::FromBytes;
 
-/// DRI and its length (ITU-T T.81, B.2.4.4), without the interval.
+/// Marker and length of the segment "define restart interval" (DRI, ITU-T T.81, B.2.4.4), without the interval.
 const RESTART_INTERVAL: [u8; 4] = [0xff, 0xdd, 0, 4];
 /// Length of this segment. [bytes]
 const RESTART_INTERVAL_BYTES: usize = 6;

@@ -83,7 +83,7 @@ pub struct ImagingConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FilterKind {
-    /// Three colours in every image pixel, as if each joined many sensor pixels.
+    /// Three colours in every image pixel, as if it combined many sensor pixels.
     Rgb,
     /// One colour per pixel, interpolated.
     Bayer,

@@ -205,7 +205,7 @@ impl Source {
         if frozen { Err(Rejected::Frozen(since_s)) } else { Ok(()) }
     }
 
-    /// Returns the pending claim of earlier poses, if this pose supports it.
+    /// Returns the [`Claim`] of the last rejected poses, if `surprise` agrees with it.
     pub(super) fn pending(&self, surprise: &Surprise) -> Option<Claim> {
         self.claim.filter(|claim| claim.is_made_by(surprise))
     }
@@ -406,7 +406,8 @@ const EARLY_S: f64 = 0.02;
 const LATE_S: f64 = 1.0;
 /// Minimum jump of a clock: packets overtake each other by less. [s]
 const CLOCK_JUMP_S: f64 = 0.25;
-/// Minimum interval of stamps: closer ones belong to packets that were read at once. [s]
+/// Minimum interval between two stamps of a source; a pose with a closer stamp is rejected. Packets that
+/// wait in the socket and are stamped when they are read have such stamps. [s]
 const MIN_APART_S: f64 = 0.000_5;
 /// Minimum speed for the detection of a frozen stream: slower motion is close to the noise. [m/s]
 const MOVING_MPS: f64 = 0.3;
@@ -418,7 +419,7 @@ const FROZEN_M: f64 = 0.01;
 const FROZEN_RAD: f64 = 0.06;
 /// Drift of a gyroscope before its bias is known. [rad/s]
 const GYRO_DRIFT_RADPS: f64 = 0.03;
-/// Maximum time between poses of one claim; slower sources are not used for flight. [s]
+/// Maximum time between two poses of a [`Claim`]. Sources with a longer interval are too slow for flight. [s]
 const CLAIM_LASTS_S: f64 = 0.25;
 /// Tolerance within a claim, in standard deviations of the measurement.
 const FITS_SIGMAS: f64 = 4.0;

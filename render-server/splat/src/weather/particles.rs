@@ -39,7 +39,8 @@ pub(super) struct Streak {
     pub(super) color: [f32; 3],
 }
 
-/// Minimum opacity of a drawn streak: half of the step of a byte, in front of a dark wall.
+/// Minimum opacity of a drawn streak. In front of a dark wall, a fainter streak changes an 8-bit pixel by
+/// less than half a step.
 const LEAST: f32 = 0.006;
 /// Minimum distance of a drawn particle. Nearer ones are out of focus for any lens. [m]
 const NEAR_M: f32 = 0.12;

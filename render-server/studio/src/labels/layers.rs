@@ -50,7 +50,8 @@ pub fn instances(depth_m: &[f32], ids: &[u16], is_thing: &[bool], out: &mut Vec<
     }));
 }
 
-/// Maximum difference of expected and median depth on one surface. [m], and relative to the depth.
+/// Maximum difference between expected and median depth on one surface: the sum of `SAME_M` [m] and `SAME`
+/// times the depth.
 const SAME_M: f32 = 0.02;
 const SAME: f32 = 0.02;
 

@@ -56,7 +56,7 @@ pub struct Sighting {
 pub struct TagSighting {
     /// Index in [`Capture::tags`].
     pub tag: usize,
-    /// Corners: lower left, lower right, upper right, upper left. [px]
+    /// Corners of the tag as printed: lower left, lower right, upper right, upper left. [px]
     pub corners_px: [DVec2; 4],
 }
 

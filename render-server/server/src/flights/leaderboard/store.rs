@@ -31,7 +31,7 @@ pub enum LeaderboardError {
     /// The tables are of a later version, or of another program.
     #[error("cannot use the leaderboard {0}: {1}; was it made by a later version of this program?")]
     Migrate(Database, sqlx::migrate::MigrateError),
-    /// The folder of a file cannot be made.
+    /// The folder of the database file cannot be created.
     #[error("cannot make the folder of the leaderboard {0}: {1}")]
     Folder(Database, std::io::Error),
     /// A query failed.
@@ -426,7 +426,7 @@ pub(super) fn unix_ms() -> i64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as i64)
 }
 
-/// Maximum number of runs listed: some terms of a large class.
+/// Maximum number of runs listed: enough for several terms of a large class.
 pub const MAX_RUNS: i64 = 20_000;
 /// Maximum length of a team's name. [characters]
 const MAX_NAME: usize = 40;

@@ -53,7 +53,7 @@ pub struct LocalizationConfig {
     /// Orientation of the object's own axes; as the stream's by default.
     #[serde(default, skip_serializing_if = "is_default")]
     pub body: BodyAxes,
-    /// Direction of the vehicle's nose in the object's axes; x by default.
+    /// Nose of the vehicle; x by default.
     #[serde(default, skip_serializing_if = "is_default")]
     pub nose: Nose,
     /// Position and heading of the stream's origin in the world.
