@@ -1,13 +1,12 @@
 //! Command line of `vizflyt sim`, and of this crate's own binary.
 
-use std::fmt::Display;
-use std::io::Write;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::Args;
 use glam::DVec3;
+use vizflyt_process::print_line;
 use vizflyt_protocol::geometry::Volume;
 
 use crate::autopilot::airframe;
@@ -364,12 +363,12 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
             "ready": "simulator", "mavlink": addresses[0], "links": addresses,
             "mocap": driver.mocap_addresses()?,
         });
-        print(&ready);
+        print_line(ready);
     } else {
         for (endpoint, address) in endpoints.iter().zip(&addresses) {
-            print(&format!("MAVLink {endpoint} (our address {address})"));
+            print_line(format!("MAVLink {endpoint} (our address {address})"));
         }
-        print(&"simulator ready; Ctrl-C ends it");
+        print_line("simulator ready; Ctrl-C ends it");
     }
     // The loop runs in a separate thread, because the caller's thread may be busy.
     let (simulation, lost_s) = std::thread::Builder::new()
@@ -382,10 +381,10 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
     if args.json {
         let mut report = serde_json::to_value(&report).context("simulator: report")?;
         report["seconds_given_up"] = lost_s.into();
-        print(&serde_json::json!({ "report": report }));
+        print_line(serde_json::json!({ "report": report }));
     } else {
         let truth = &report.truth;
-        print(&format!(
+        print_line(format!(
             "flew {:.1} s, {:.1} m, at {:.1} m/s on average and {:.1} m/s at most; {}{}",
             truth.flight_seconds,
             truth.path_m,
@@ -398,12 +397,6 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
         ));
     }
     Ok(())
-}
-
-/// Prints a line. Unlike `println!`, it does not panic if the reader has closed the pipe.
-fn print(line: &impl Display) {
-    let mut out = std::io::stdout().lock();
-    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 use std::io::IsTerminal;
 
 use clap::Parser;
+use vizflyt_process::{LogWriter, finish_output, never_wait_for_readers};
 use vizflyt_simulator::{SimArgs, run};
 
 #[derive(Parser)]
@@ -14,8 +15,12 @@ struct Command {
 
 fn main() -> anyhow::Result<()> {
     tracing_subscriber::fmt()
-        .with_writer(std::io::stderr)
+        .with_writer(|| LogWriter)
         .with_ansi(std::io::stderr().is_terminal())
         .init();
-    run(Command::parse().args)
+    let args = Command::parse().args;
+    never_wait_for_readers();
+    let result = run(args);
+    finish_output();
+    result
 }

@@ -40,7 +40,7 @@ use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use tracing_subscriber::filter::Targets;
 use tracing_subscriber::prelude::*;
 use vizflyt_grading::class;
-use vizflyt_process::{print_error, print_line};
+use vizflyt_process::{LogWriter, finish_output, never_wait_for_readers, print_error, print_line};
 use vizflyt_server::settings;
 use vizflyt_studio::{arena, dataset, evaluate, export, scene};
 
@@ -160,12 +160,34 @@ pub fn main() -> ExitCode {
         print_error(format_args!("error: --log-level '{log_level}': {error}"));
         return ExitCode::from(2);
     }
-    match run(cli.command, &log_level) {
-        Ok(code) => code,
-        Err(error) => {
-            print_error(format_args!("error: {error:#}"));
-            ExitCode::FAILURE
-        }
+    if cli.command.flies_or_serves() {
+        never_wait_for_readers();
+    }
+    let code = run(cli.command, &log_level).unwrap_or_else(|error| {
+        print_error(format_args!("error: {error:#}"));
+        ExitCode::FAILURE
+    });
+    finish_output();
+    code
+}
+
+impl Command {
+    /// Returns whether a vehicle depends on this process, so that it must not wait for the reader of its output.
+    fn flies_or_serves(&self) -> bool {
+        let has_flight = matches!(
+            self,
+            Self::Demo(_)
+                | Self::Fly(_)
+                | Self::Serve(_)
+                | Self::Sim(_)
+                | Self::Bridge(_)
+                | Self::Tags(_)
+        );
+        #[cfg(feature = "crazyflie")]
+        let has_flight = has_flight || matches!(self, Self::Crazyflie(_));
+        #[cfg(feature = "ros2")]
+        let has_flight = has_flight || matches!(self, Self::Ros2(_));
+        has_flight
     }
 }
 
@@ -239,7 +261,7 @@ fn quiet_mesa() {
 /// Sends logs to standard error; standard output is for results.
 fn start_log(filter: &str) -> Result<()> {
     let printed = tracing_subscriber::fmt::layer()
-        .with_writer(std::io::stderr)
+        .with_writer(|| LogWriter)
         // No colours in files and pipes.
         .with_ansi(std::io::stderr().is_terminal())
         // Internal errors are printed to standard error, which may itself be closed.

@@ -2,7 +2,7 @@
 //! server or a flight's log.
 
 use std::fmt::Write as _;
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -10,6 +10,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use vizflyt_arena::pose::{PoseQuality, Rejects};
+use vizflyt_process::{OutputStream, print_text};
 use vizflyt_protocol::messages::{
     Arrivals, ClockState, INTERVAL_EDGES_MS, Intervals, Stage, StageTimes, Timing,
 };
@@ -60,16 +61,16 @@ pub(crate) fn run(args: &StatsArgs) -> Result<ExitCode> {
         } else {
             format!("{}\n\n{}", path.display(), of_timing(&timing, true))
         };
-        print(&text);
+        print_text(OutputStream::Out, text.as_bytes());
         return Ok(ExitCode::SUCCESS);
     }
     loop {
         let text = if args.json { ask(args)? } else { of_vehicle(&parse(&ask(args)?)?)? };
         if args.watch && std::io::stdout().is_terminal() {
             // Move the cursor home and clear the screen.
-            print("\x1b[H\x1b[J");
+            print_text(OutputStream::Out, b"\x1b[H\x1b[J");
         }
-        print(&text);
+        print_text(OutputStream::Out, text.as_bytes());
         if !args.watch {
             return Ok(ExitCode::SUCCESS);
         }
@@ -311,12 +312,6 @@ fn of_connection(connection: &Connection) -> String {
         connection.window / 1000,
         connection.mtu
     )
-}
-
-/// Prints; unlike `print!` it does not panic if the reader has closed the pipe.
-fn print(text: &str) {
-    let mut out = std::io::stdout().lock();
-    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
 }
 
 /// Reasons for skipped images, in the order of the stages.

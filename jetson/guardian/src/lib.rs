@@ -8,7 +8,7 @@
 //!         ◀────────────────────────────────────────── port ◀──
 //! server ── sealed datagrams ── feed ────────▶ watch (if the runtime sends no poses)
 //! ```
-//! Three threads, one lock, no allocation after the start (tested), no async. [`watch`] decides, sans-IO, by the same
+//! Four threads (one only prints), one lock, no allocation after the start (tested), no async. [`watch`] decides, sans-IO, by the same
 //! rules as the bridge on the vehicle ([`vizflyt_protocol::failsafe`]). [`port`] carries bytes. [`client`] is the
 //! runtime's end. Signals and keys that end the runtime do not reach the guardian.
 
@@ -22,6 +22,7 @@ use std::io::{self, Write};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
@@ -54,7 +55,12 @@ struct Shared {
     runtime: OwnedFd,
     feed: Mutex<Option<Feed>>,
     is_over: AtomicBool,
+    /// Notes for standard error. Printed on a separate thread, because its reader may have stopped reading.
+    notes: SyncSender<&'static str>,
 }
+
+/// Maximum number of notes that wait for the reader of standard error; further ones are dropped.
+const NOTES: usize = 16;
 
 /// Guards one flight on the port at `address`, in the format of `--mavlink`, with the runtime on standard input.
 /// Returns when the flight is over and the vehicle is on the ground or lost.
@@ -92,12 +98,17 @@ fn try_run(address: &str) -> io::Result<()> {
     };
     put(runtime.as_fd(), MessageKind::Ready, port.local()?.as_bytes())?;
     setsockopt(&runtime, ReceiveTimeout, &TimeVal::milliseconds(TICK_MS))?;
+    let (notes, printed) = sync_channel(NOTES);
+    thread::Builder::new()
+        .name("notes".into())
+        .spawn(move || printed.iter().for_each(|note: &str| complain(note)))?;
     let shared = Arc::new(Shared {
         port,
         watch: Mutex::new(Watch::new(host_now(), wanted)),
         runtime,
         feed: Mutex::new(None),
         is_over: AtomicBool::new(false),
+        notes,
     });
     for (name, body) in [("port", hear_autopilot as fn(&Shared)), ("poses", hear_poses)] {
         let shared = Arc::clone(&shared);
@@ -186,7 +197,7 @@ impl Shared {
     }
 
     fn out(&self) -> PortOut<'_> {
-        PortOut { port: &self.port, runtime: self.runtime.as_fd() }
+        PortOut { port: &self.port, runtime: self.runtime.as_fd(), notes: &self.notes }
     }
 }
 
@@ -194,6 +205,7 @@ impl Shared {
 struct PortOut<'a> {
     port: &'a Port,
     runtime: BorrowedFd<'a>,
+    notes: &'a SyncSender<&'static str>,
 }
 
 impl Out for PortOut<'_> {
@@ -202,7 +214,7 @@ impl Out for PortOut<'_> {
     }
 
     fn say(&mut self, sentence: &'static str) {
-        complain(sentence);
+        let _ = self.notes.try_send(sentence);
         let _ = put(self.runtime, MessageKind::Note, sentence.as_bytes());
     }
 }

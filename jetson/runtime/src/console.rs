@@ -3,10 +3,11 @@
 //!
 //! [`Console`] has no side effects: it returns the text. [`Screen`] writes it.
 
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
+use vizflyt_process::{OutputStream, print_text};
 use vizflyt_protocol::messages::{FlightPhase, Telemetry};
 
 /// Content of the status line.
@@ -199,13 +200,11 @@ impl Drop for Screen {
     }
 }
 
-/// Writes to standard output. Unlike `print!`, does not panic if the reader has closed the pipe.
 fn write(text: &str) {
     if text.is_empty() {
         return;
     }
-    let mut out = std::io::stdout().lock();
-    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+    print_text(OutputStream::Out, text.as_bytes());
 }
 
 #[cfg(test)]

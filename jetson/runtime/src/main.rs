@@ -4,6 +4,7 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use clap::Parser;
+use vizflyt_process::{LogWriter, finish_output, never_wait_for_readers, print_error};
 use vizflyt_runtime::{FlyArgs, fly};
 
 #[derive(Parser)]
@@ -20,16 +21,19 @@ fn main() -> ExitCode {
     {
         return vizflyt_guardian::run(&address);
     }
+    never_wait_for_readers();
     tracing_subscriber::fmt()
-        .with_writer(std::io::stderr)
+        .with_writer(|| LogWriter)
         .with_ansi(std::io::stderr().is_terminal())
         .init();
-    match fly(Program::parse().fly) {
+    let code = match fly(Program::parse().fly) {
         Ok(end) if end.outcome().is_good() => ExitCode::SUCCESS,
         Ok(_) => ExitCode::from(3),
         Err(error) => {
-            eprintln!("vizflyt-jetson: {error:#}");
+            print_error(format_args!("vizflyt-jetson: {error:#}"));
             ExitCode::FAILURE
         }
-    }
+    };
+    finish_output();
+    code
 }

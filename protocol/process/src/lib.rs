@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! print_line, print_fmt!, print_error   print lines; no panic if the reader has ended
+//! never_wait_for_readers                output through queues, for commands that fly or serve
 //! on_interrupt                          calls back on each SIGINT and SIGTERM
 //! stop_flag                             flag set by these signals, or when standard input ends (end of the parent)
 //! lock                                  locks a mutex, even after a thread has panicked
@@ -13,10 +14,10 @@
 mod clock;
 pub mod descriptors;
 mod lock;
+mod output;
 mod usage;
 
-use std::fmt::Display;
-use std::io::{Read, Write};
+use std::io::Read;
 use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -24,19 +25,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, Result};
 pub use clock::monotonic_ns;
 pub use lock::lock;
+pub use output::{
+    LogWriter, OutputStream, finish_output, never_wait_for_readers, print_error, print_line,
+    print_text,
+};
 use tokio::signal::unix::{SignalKind, signal};
 pub use usage::processor_seconds;
-
-/// Prints a line on standard output. Unlike `println!`, it does not panic if the reader has closed the pipe.
-pub fn print_line(line: impl Display) {
-    let mut out = std::io::stdout().lock();
-    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
-}
-
-/// Prints a line on standard error. Unlike `eprintln!`, it does not panic if the reader has closed the pipe.
-pub fn print_error(line: impl Display) {
-    let _ = writeln!(std::io::stderr().lock(), "{line}");
-}
 
 /// Prints a line, formatted as by `println!`. See [`print_line`].
 #[macro_export]

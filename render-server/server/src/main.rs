@@ -3,6 +3,7 @@
 use std::io::{IsTerminal, Write};
 
 use clap::{CommandFactory, FromArgMatches, Parser};
+use vizflyt_process::{LogWriter, finish_output, never_wait_for_readers};
 use vizflyt_server::settings;
 
 #[derive(Parser)]
@@ -14,7 +15,7 @@ struct Cli {
 
 fn main() -> anyhow::Result<()> {
     tracing_subscriber::fmt()
-        .with_writer(std::io::stderr)
+        .with_writer(|| LogWriter)
         .with_ansi(std::io::stderr().is_terminal())
         .init();
     let matches = Cli::command().get_matches();
@@ -25,5 +26,8 @@ fn main() -> anyhow::Result<()> {
         let _ = std::io::stdout().write_all(settings::to_toml(&matches).as_bytes());
         return Ok(());
     }
-    vizflyt_server::serve(Cli::from_arg_matches(&matches)?.serve)
+    never_wait_for_readers();
+    let result = vizflyt_server::serve(Cli::from_arg_matches(&matches)?.serve);
+    finish_output();
+    result
 }

@@ -37,8 +37,7 @@ use crate::render::{RendererInfo, Rendering};
 use crate::scene::Scenes;
 use crate::stop::Stop;
 use crate::stream::{Rooms, Streaming, transport};
-use vizflyt_process::descriptors;
-use vizflyt_process::lock;
+use vizflyt_process::{descriptors, lock, print_fmt};
 
 use crate::web::previews::Previews;
 use crate::web::{self, Access, Lab, Logins, Page, PageTls, Rates, TwinPictures};
@@ -302,11 +301,11 @@ fn open_pairing(authorizer: &Arc<Authorizer>, grant: &Grant, port: u16, json: bo
     if json {
         print::line(&serde_json::json!({ "pairing": { "code": window.code.to_string() } }));
     } else {
-        print::plain(&format!(
+        print_fmt!(
             "pairing      code {}, good for {} s: on the other computer `vizflyt pair HOST:{port}`",
             window.code,
             window.left.as_secs()
-        ));
+        );
     }
     let mut news = authorizer.pairing_news();
     news.mark_unchanged();
@@ -316,7 +315,7 @@ fn open_pairing(authorizer: &Arc<Authorizer>, grant: &Grant, port: u16, json: bo
             if json {
                 print::line(&serde_json::json!({ "pairing": { "news": text } }));
             } else {
-                print::plain(&format!("pairing      {text}"));
+                print_fmt!("pairing      {text}");
             }
         }
     });

@@ -18,7 +18,7 @@ use crate::stream::delivery::CameraDelivery;
 use crate::stream::vehicle::ImageCounters;
 use crate::timing::StageDurations;
 use crate::web::{PageKeys, ServerStages};
-use vizflyt_process::lock;
+use vizflyt_process::{lock, print_fmt, print_line};
 
 /// Contents of the ready line.
 #[derive(Debug, Serialize)]
@@ -91,7 +91,7 @@ pub(super) fn page_keys(keys: &PageKeys, http: &str, names: &[&str], json: bool)
         if json {
             line(&serde_json::json!({ "page_key": { "for": whose, "link": link } }));
         } else {
-            plain(&format!("page key     {link} ({whose})"));
+            print_fmt!("page key     {link} ({whose})");
         }
     }
 }
@@ -116,8 +116,8 @@ pub(super) async fn events(vehicle: Arc<VehicleFlight>, alone: bool, json: bool)
                 (true, false) => {
                     line(&serde_json::json!({ "vehicle": vehicle.name, "event": entry.event }));
                 }
-                (false, true) => plain(&entry.event.text),
-                (false, false) => plain(&format!("{}: {}", vehicle.name, entry.event.text)),
+                (false, true) => print_line(&entry.event.text),
+                (false, false) => print_fmt!("{}: {}", vehicle.name, entry.event.text),
             }
         }
     }
@@ -128,26 +128,23 @@ pub(super) fn ready(json: bool, ready: &Ready<'_>) {
     if json {
         return line(ready);
     }
-    plain(&format!("arena        {}", ready.arena));
-    plain(&format!("renderer     {} ({})", ready.renderer, ready.renderer_reason));
-    plain(&format!("page         {}", ready.http));
+    print_fmt!("arena        {}", ready.arena);
+    print_fmt!("renderer     {} ({})", ready.renderer, ready.renderer_reason);
+    print_fmt!("page         {}", ready.http);
     if let Some(fingerprint) = &ready.page_certificate {
-        plain(&format!("certificate  {fingerprint} (the page's; compare it when a browser asks)"));
+        print_fmt!("certificate  {fingerprint} (the page's; compare it when a browser asks)");
     }
     for source in &ready.pose {
-        plain(&format!("{:<12} {} (poses)", source.driver.name(), source.address));
+        print_fmt!("{:<12} {} (poses)", source.driver.name(), source.address);
     }
     for vehicle in &ready.vehicles {
         let named = match &*ready.vehicles {
             [one] if one.name == "vizflyt" => String::new(),
             _ => format!(" --vehicle {}", vehicle.name),
         };
-        plain(&format!(
-            "runtime      vizflyt fly PLUGIN --server HOST:{}{named}",
-            ready.quic.port()
-        ));
+        print_fmt!("runtime      vizflyt fly PLUGIN --server HOST:{}{named}", ready.quic.port());
     }
-    plain(&format!("identity     {} ({} paired)", ready.fingerprint, ready.paired));
+    print_fmt!("identity     {} ({} paired)", ready.fingerprint, ready.paired);
 }
 
 /// Prints the report at the end.
@@ -155,7 +152,7 @@ pub(super) fn report(json: bool, report: &ServerReport) {
     if json {
         return line(&serde_json::json!({ "report": report }));
     }
-    plain(&format!(
+    print_fmt!(
         "{} images sent, {} ticks rendered ({} skipped); render {:.1} ms, p99 {:.1}; peak memory {:.0} MB; {}",
         report.images_sent,
         report.ticks,
@@ -164,22 +161,15 @@ pub(super) fn report(json: bool, report: &ServerReport) {
         report.render_ms_p99,
         report.peak_rss_mb,
         report.renderer
-    ));
+    );
 }
 
 /// Prints a JSON line.
 pub(super) fn line(value: &impl Serialize) {
     match serde_json::to_string(value) {
-        Ok(text) => plain(&text),
+        Ok(text) => print_line(text),
         Err(error) => tracing::warn!("a line was not printed: {error}"),
     }
-}
-
-/// Prints a line. Unlike `println!`, it does not panic if the reader has closed the pipe.
-pub(super) fn plain(text: &str) {
-    use std::io::Write;
-    let mut out = std::io::stdout().lock();
-    let _ = writeln!(out, "{text}").and_then(|()| out.flush());
 }
 
 /// Report at the end of the server.

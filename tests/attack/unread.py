@@ -1,0 +1,104 @@
+"""Output that is not read: a full pipe at `serve`, `demo` and `fly` must not delay STOP, the guard or the poses. See `run`."""
+
+import contextlib
+import json
+import os
+import pathlib
+import subprocess
+import tempfile
+import time
+import urllib.request
+
+from checks import VIZFLYT, check, end, scene
+
+# The goal is 50 ms; a loaded machine gets much longer. A blocked server did not answer for seconds.
+STOP_WITHIN_S = 1.0
+PRESSES = 20
+
+
+class Unread:
+    """A running `vizflyt` whose standard output and standard error are one pipe, read only up to a line."""
+
+    def __init__(self, *arguments):
+        self.reader, self.writer = os.pipe()
+        self.process = subprocess.Popen([VIZFLYT, *map(str, arguments)], stdin=subprocess.PIPE, stdout=self.writer,
+                                        stderr=self.writer)
+        self.text = ""
+
+    def read_until(self, part, within_s=120.0):
+        """Reads until `part` has been printed; returns its line."""
+        until = time.monotonic() + within_s
+        os.set_blocking(self.reader, False)
+        while part not in self.text or "\n" not in self.text.split(part, 1)[1]:
+            if time.monotonic() > until or self.process.poll() is not None:
+                raise TimeoutError(f"'{part}' was not printed: {self.text[-2000:]}")
+            with contextlib.suppress(BlockingIOError):
+                self.text += os.read(self.reader, 65536).decode(errors="replace")
+            time.sleep(0.01)
+        before, after = self.text.split(part, 1)
+        return before.rsplit("\n", 1)[-1] + part + after.split("\n", 1)[0]
+
+    def fill(self):
+        """Fills the pipe, so that the next write of the program blocks."""
+        # Opened again: the program's end must stay a blocking one.
+        full = os.open(f"/proc/self/fd/{self.writer}", os.O_WRONLY | os.O_NONBLOCK)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(full, b"x" * 512)
+        os.close(full)
+
+    def end(self, within_s=20.0):
+        """Asks the program to end; returns whether it does, with the pipe still full."""
+        self.process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(within_s)
+            return True
+        self.process.kill()
+        self.process.wait()
+        return False
+
+
+def press(page):
+    """Presses STOP; returns the time until the answer [s]."""
+    request = urllib.request.Request(f"{page}/api/estop", data=b"", method="POST", headers={"Origin": page})
+    began = time.monotonic()
+    with contextlib.suppress(OSError), urllib.request.urlopen(request, timeout=10):
+        pass
+    return time.monotonic() - began
+
+
+def serving(folder):
+    arena = scene(folder)
+    server = Unread("serve", "--json", "--lifeline", "--renderer=cpu", "--quic=127.0.0.1:0", "--http=127.0.0.1:0",
+                    "--vicon=127.0.0.1:0", "--leaderboard=none", "--keys", folder / "keys", arena)
+    try:
+        page = json.loads(server.read_until('"ready"'))["http"].rstrip("/")
+        server.fill()
+        took_s = sorted(press(page) for _ in range(PRESSES))
+        check("STOP while the server's output is not read", took_s[-1] < STOP_WITHIN_S,
+              f"took {[round(s, 2) for s in took_s]} s")
+    finally:
+        has_ended = server.end()
+    check("a server whose output is not read ends on SIGTERM", has_ended)
+
+
+def flying(folder):
+    report = folder / "report.json"
+    demo = Unread("demo", "--headless", "--max-rate=40", "--seconds=8", "--log=none", "--report", report)
+    try:
+        demo.read_until("the plugin flies")
+        demo.fill()
+        demo.process.wait(60)
+    except subprocess.TimeoutExpired:
+        check("a flight whose output is not read ends", False)
+    finally:
+        demo.end()
+    outcome = json.loads(report.read_text()) if report.exists() else {}
+    check("a flight whose output is not read goes on to its end", outcome.get("outcome") in ("landed", "finished"),
+          f"{outcome.get('outcome')}: {outcome.get('reason')}")
+
+
+with tempfile.TemporaryDirectory() as name:
+    serving(pathlib.Path(name))
+    flying(pathlib.Path(name))
+end()
