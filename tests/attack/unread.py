@@ -1,4 +1,4 @@
-"""Output that is not read: a full pipe at `serve`, `demo` and `fly` must not delay STOP, the guard or the poses. See `run`."""
+"""Output that is not read: a full pipe at `serve` and `demo` must not delay STOP, the guard or the poses. See `run`."""
 
 import contextlib
 import json
