@@ -17,6 +17,8 @@ SITE = pathlib.Path(__file__).resolve().parent
 ROOT = SITE.parents[1]
 REPOSITORY = "https://github.com/vizflyt/vizflyt"
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
+# The site's language of a code block has no attributes of rustdoc: ```rust,no_run
+ATTRIBUTES = re.compile(r"^(```\w+),[\w,]+$", re.M)
 CODE = re.compile(r"(^(?:```|~~~).*?^(?:```|~~~)[^\n]*$|`[^`\n]*`)", re.M | re.S)
 PYTHON = """# Python API
 
@@ -82,7 +84,7 @@ def main() -> None:
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
         if name.endswith(".md"):
-            target.write_text(led(name, source.read_text()))
+            target.write_text(led(name, ATTRIBUTES.sub(r"\1", source.read_text())))
         else:
             shutil.copy(source, target)
     reference = folder / "docs/reference"
