@@ -1,6 +1,6 @@
 """Learns to fly through the three windows of project p3 with Ray's RLlib, on one node or several; says how fast.
 
-pip install 'vizflyt[gym]' 'ray[rllib]' torch
+pip install gymnasium 'ray[rllib]' torch
 python learn_ray.py
 python learn_ray.py --nodes 2                                  two nodes of Ray's on this machine, a core each
 python learn_ray.py --address HOST:6379                        nodes that run already (`ray start`)

@@ -1,6 +1,6 @@
 """Learns to fly through the three windows of project p3, from the state; says how the last hundred episodes ended.
 
-pip install 'vizflyt[gym]' stable-baselines3
+pip install gymnasium stable-baselines3
 python learn_windows.py
 python learn_windows.py --fly windows.zip                      flies courses that it has not seen
 python learn_windows.py --export wing                          makes a plugin of it, which needs numpy alone

@@ -1,6 +1,6 @@
 //! `vizflyt.toml`: plugin of a student's folder, and its simulated lab.
 
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use serde::Deserialize;
@@ -75,7 +75,8 @@ impl PluginManifest {
         let text = std::fs::read_to_string(&file)
             .with_context(|| format!("cannot read {}", file.display()))?;
         let mut manifest = Self::parse(&text).with_context(|| format!("{}", file.display()))?;
-        manifest.plugin = folder.join(&manifest.plugin);
+        manifest.plugin = beneath(folder, &manifest.plugin)
+            .with_context(|| format!("{}: plugin", file.display()))?;
         let LabConfig { scene, project, .. } = &mut manifest.lab;
         // Path of a project file; a project's name is not a path.
         let is_file =
@@ -95,9 +96,47 @@ impl PluginManifest {
     }
 }
 
+/// Returns the path of `file` in `folder`.
+///
+/// # Errors
+/// If it leads out of the folder, also through a symbolic link: a grade signs the folder's files.
+fn beneath(folder: &Path, file: &Path) -> Result<PathBuf> {
+    let path = folder.join(file);
+    let is_inside = match (folder.canonicalize(), path.canonicalize()) {
+        (Ok(folder), Ok(path)) => path.starts_with(folder),
+        // The file does not exist; reported later.
+        _ => file.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir)),
+    };
+    if !is_inside {
+        bail!("'{}' is not in this folder; move the file into it", file.display());
+    }
+    Ok(path)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn rejects_a_plugin_outside_the_folder() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("hand-in");
+        std::fs::create_dir(&folder).unwrap();
+        let other = root.path().join("other.py");
+        std::fs::write(&other, "").unwrap();
+        std::os::unix::fs::symlink(&other, folder.join("link.py")).unwrap();
+        std::fs::write(folder.join("plugin.py"), "").unwrap();
+        let absolute = other.display().to_string();
+        for plugin in [&*absolute, "../other.py", "link.py", "../absent.py", "/absent.py"] {
+            std::fs::write(folder.join(FILE), format!("plugin = \"{plugin}\"\n")).unwrap();
+            let error = format!("{:#}", PluginManifest::read(&folder).unwrap_err());
+            assert!(error.contains("is not in this folder"), "{plugin}: {error}");
+        }
+        for plugin in ["plugin.py", "./plugin.py", "absent.py"] {
+            std::fs::write(folder.join(FILE), format!("plugin = \"{plugin}\"\n")).unwrap();
+            assert!(PluginManifest::read(&folder).is_ok(), "{plugin}");
+        }
+    }
 
     #[test]
     fn resolves_paths_relative_to_the_folder() {

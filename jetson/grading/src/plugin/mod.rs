@@ -39,7 +39,8 @@ enum PluginKind {
     Script(PathBuf),
     /// Folder of a Cargo.toml.
     Cargo(PathBuf),
-    Program,
+    /// Program: a path, or a name that is searched in PATH.
+    Program(PathBuf),
 }
 
 impl Plugin {
@@ -73,7 +74,7 @@ impl Plugin {
             return found(kind_of(path)?, None);
         }
         if is_bare && on_path(name) {
-            return found(PluginKind::Program, None);
+            return found(PluginKind::Program(name.into()), None);
         }
         bail!(
             "there is no plugin at {}; give a folder made by `vizflyt new`, a .py file, a program, \
@@ -97,7 +98,7 @@ impl Plugin {
     pub fn watched(&self) -> PathBuf {
         match &self.kind {
             PluginKind::BuiltIn => std::env::current_exe().unwrap_or_default(),
-            PluginKind::Program => PathBuf::from(&self.name),
+            PluginKind::Program(path) => path.clone(),
             PluginKind::Cargo(folder) => folder.clone(),
             // Imports are in the same folder.
             PluginKind::Script(script) => match script.parent() {
@@ -118,11 +119,10 @@ impl Plugin {
                 let program = std::env::current_exe().context("cannot find this program's path")?;
                 Ok(vec![program.into(), "plugin".into(), self.name.clone()])
             }
-            PluginKind::Program => {
-                let path = Path::new(&self.name);
-                // A graded plugin starts in another folder, so a relative path must be made
-                // absolute; a name in PATH stays.
-                Ok(vec![if path.is_file() { absolute(path)?.into() } else { self.name.clone() }])
+            // A graded plugin starts in another folder, so a relative path must be made absolute; a
+            // name in PATH stays.
+            PluginKind::Program(path) => {
+                Ok(vec![if path.is_file() { absolute(path)?.into() } else { path.into() }])
             }
             PluginKind::Cargo(folder) => Ok(vec![cargo::build(folder, limits)?.into()]),
             PluginKind::Script(script) => {
@@ -156,7 +156,7 @@ fn kind_of(path: &Path) -> Result<PluginKind> {
     if mode & 0o111 == 0 {
         bail!("{0} is neither a .py file nor a program; try `chmod +x {0}`", path.display());
     }
-    Ok(PluginKind::Program)
+    Ok(PluginKind::Program(path.to_owned()))
 }
 
 fn on_path(name: &OsStr) -> bool {
@@ -271,6 +271,7 @@ pub fn sources() -> Result<PathBuf> {
 #[cfg(test)]
 mod tests {
     use std::fs;
+    use std::os::unix::fs::PermissionsExt;
 
     use super::*;
 
@@ -287,7 +288,7 @@ mod tests {
         let path = |name: &str| folder.path().join(name);
         let kind = |path: &Path| Plugin::find(path.as_os_str()).unwrap().kind;
         assert_eq!(kind(Path::new("avoid")), PluginKind::BuiltIn);
-        assert_eq!(kind(Path::new("sh")), PluginKind::Program, "on PATH");
+        assert_eq!(kind(Path::new("sh")), PluginKind::Program("sh".into()), "on PATH");
         refused(&path("none"), &["there is no plugin at", "none", "avoid"]);
         refused(Path::new("no-such-program"), &["there is no plugin at no-such-program"]);
         refused(folder.path(), &["folder without", "vizflyt new"]);
@@ -305,6 +306,13 @@ mod tests {
 
         fs::write(path("notes.txt"), "").unwrap();
         refused(&path("notes.txt"), &["neither", "chmod +x"]);
+        // A manifest may name a program: that starts, not the folder's name.
+        fs::write(path("go"), "").unwrap();
+        fs::set_permissions(path("go"), fs::Permissions::from_mode(0o755)).unwrap();
+        fs::write(path("vizflyt.toml"), "plugin = \"go\"\n").unwrap();
+        let plugin = Plugin::find(folder.path().as_os_str()).unwrap();
+        let command = plugin.command(&PluginLimits::default()).unwrap();
+        assert_eq!(command, [path("go").into_os_string()]);
         fs::write(path("vizflyt.toml"), "plugin = \"gone.py\"\n").unwrap();
         refused(folder.path(), &["no file", "gone.py"]);
         fs::write(path("vizflyt.toml"), "plugins = \"gone.py\"\n").unwrap();

@@ -50,7 +50,7 @@ try:
     from gymnasium.vector import AutoresetMode
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise ImportError("vizflyt.gym needs Gymnasium: pip install 'vizflyt[gym]'") from error
+    raise ImportError("vizflyt.gym needs Gymnasium: pip install gymnasium") from error
 
 FLYING, CRASHED, LEFT_FENCE, FINISHED, TIME_UP = range(5)
 _ENDS = ("flying", "crashed", "left the fence", "finished", "time is up")
