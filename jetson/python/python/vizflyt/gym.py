@@ -2,7 +2,7 @@
 
 ::
 
-    import gymnasium, vizflyt.gym                                          # needs `pip install vizflyt[gym]`
+    import gymnasium, vizflyt.gym                                          # needs Gymnasium
     env = gymnasium.make("vizflyt/Forest-v0")                              # the state
     envs = gymnasium.make_vec("vizflyt/Race-v0", num_envs=16, camera=(64, 48), observation=("state", "depth"))
 
