@@ -59,7 +59,7 @@ def test_mistakes_are_named():
         buffer().observation().sensor("left")
     with pytest.raises(LookupError, match="without a sensor 'left'"):
         buffer().set_reading("left", b"")
-    with pytest.raises(ValueError, match="there are: lidar, range_finder, sonar, radar"):
+    with pytest.raises(ValueError, match="known kinds: lidar, range_finder, sonar, radar"):
         vizflyt.SensorInfo("x", "camera")
     with pytest.raises(ValueError, match="at most 8 sensors"):
         vizflyt.ArenaInfo(sensors=[vizflyt.SensorInfo(str(n), "sonar") for n in range(9)])

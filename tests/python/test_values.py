@@ -127,7 +127,7 @@ def test_poses_compose_only_where_frames_meet():
     assert np.allclose(back, np.eye(4))
     with pytest.raises(ValueError, match="world_from_body @ cam_from_body: the frames that meet, 'body' and 'cam'"):
         world_from_body @ body_from_cam.inverse()
-    with pytest.raises(TypeError, match="for points there is transform_point"):
+    with pytest.raises(TypeError, match="for points use transform_point"):
         world_from_body @ np.zeros(3)
     with pytest.raises(ValueError, match="expected world_from_body, got body_from_cam"):
         vizflyt.Vehicle(body_from_cam)

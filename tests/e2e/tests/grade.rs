@@ -387,7 +387,7 @@ fn hash_does_not_depend_on_jobs_load_or_resuming() {
 
     let output = rig.run(&resumed);
     let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(errors.contains("of 3 flights are finished already and are kept"), "{errors}");
+    assert!(errors.contains("of 3 flights are finished already and kept"), "{errors}");
     let grade: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!((&grade["hash"], &grade["runs"]), (&loaded["hash"], &loaded["runs"]));
     assert_eq!(fs::read_to_string(&record).unwrap(), kept, "it was not flown again");

@@ -109,7 +109,7 @@ mod tests {
         let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
         for (text, expected) in [
             ("", "missing field"),
-            ("password = \"open\"", "no Argon2 hash"),
+            ("password = \"open\"", "not an Argon2 hash"),
             ("password = \"x\"\nuser = 1", "unknown field"),
             (
                 "password = \"$argon2id$v=19$m=4194304,t=2,p=1$c2FsdHNhbHRzYWx0$aGFzaGhhc2hoYXNoaGFzaA\"",

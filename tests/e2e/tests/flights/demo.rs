@@ -115,7 +115,7 @@ fn flies_the_forest_and_writes_a_report() {
     // In another forest the verdict must differ.
     let other = good(&["grade", "judge", log, "--seed=8", "--json"]);
     assert!(serde_json::from_str::<Value>(&other).unwrap() != verdict);
-    check_refused(&["grade", "judge", log, "--project=p5"], &["something moves in p5"]);
+    check_refused(&["grade", "judge", log, "--project=p5"], &["p5 has moving objects"]);
 }
 
 /// The server gets a fifth of its processor time, in slices: images are late and few.
@@ -379,7 +379,7 @@ fn flies_in_a_packed_scene() {
     name(r#"scene = "forest.packed""#);
     // The obstacles are the same: the shortest path around them has the same length.
     assert_eq!(good(&["arena", "check", &arena]), in_memory);
-    check_refused(&["scene", "inspect", &packed], &["a packed scene", "that it was packed of"]);
+    check_refused(&["scene", "inspect", &packed], &["a packed scene", "that it was packed from"]);
 
     let mut demo = file.demo(&["--scene", &forest, "--seconds", "12"]);
     demo.wait(FLIGHT);

@@ -217,7 +217,7 @@ fn errors_name_the_remedy() {
     );
     student.check_refused(&["fly", "avoid", "--config", "gone.toml"], &["gone.toml"]);
 
-    student.check_refused(&["new", "2nd", "--lang", "rust"], &["'2nd' is no name"]);
+    student.check_refused(&["new", "2nd", "--lang", "rust"], &["'2nd' is not a valid plugin name"]);
     student.check_refused(&["new", "avoid", "--lang", "rust"], &["built-in"]);
     student.check_refused(&["new", "x", "--lang", "cobol"], &["cobol"]);
     student

@@ -93,7 +93,7 @@ mod tests {
         std::fs::write(&kept.path, b"no training").expect("written");
         assert!(says(false, false).contains("--resume"), "{}", says(false, false));
         assert_eq!(says(false, true), "false");
-        assert!(says(true, false).contains("hall.ply.training: these bytes are no training"));
+        assert!(says(true, false).contains("hall.ply.training: not a checkpoint"));
         kept.remove();
         assert_eq!(says(false, false), "false");
     }
