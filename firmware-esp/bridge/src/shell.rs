@@ -55,7 +55,8 @@ pub trait Platform {
     /// Takes the next bytes of a new firmware; `first` marks its beginning. Returns true with the last bytes, when the
     /// firmware is verified and will run at the next start; [`crate::update`] implements both.
     ///
-    /// # Errors Why the firmware is rejected, in words. The running firmware stays.
+    /// # Errors
+    /// Why the firmware is rejected, in words. The running firmware stays.
     fn update(&mut self, first: bool, bytes: &[u8]) -> Result<bool, &'static str> {
         let _ = (first, bytes);
         Err("this bridge does not accept firmware over the network; flash it by wire")

@@ -378,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn does_not_land_a_vehicle_without_a_companion() {
+    fn lands_only_a_vehicle_that_follows_a_companion() {
         for flight in [Flight { armed: false, ..GUIDED }, Flight { mode: 5, ..GUIDED }] {
             assert_eq!(landings(|_| flight, 1000, 20, 5000), []);
         }

@@ -205,7 +205,7 @@ fn no_tls12() -> Error {
     Error::General("TLS 1.2 is not supported".to_owned())
 }
 
-/// All keys are Ed25519; unused schemes are not offered.
+/// The keys of servers and clients are Ed25519 (the browser page's is not used here); unused schemes are not offered.
 const SCHEMES: [SignatureScheme; 1] = [SignatureScheme::ED25519];
 
 #[cfg(test)]

@@ -325,7 +325,7 @@ impl Bridge {
         self.router.failsafe.stage()
     }
 
-    /// Whether the autopilot has acknowledged the bridge's LAND.
+    /// Whether the autopilot has acknowledged LAND, or its heartbeat reports it.
     pub fn is_landing(&self) -> bool {
         self.landing().is_some_and(|stage| stage != LandingStage::Asked)
     }

@@ -167,7 +167,7 @@ impl PacketRouter {
                 whole[from..from + 4].copy_from_slice(&bits.to_le_bytes());
                 let len = whole.iter().position(|&byte| byte == 0).unwrap_or(TEXT);
                 let text = core::str::from_utf8(&whole[..len]).map_err(|_| Refused::Malformed)?;
-                // An incomplete password is rejected until its last part arrives.
+                // A password of fewer than 8 characters is rejected until more parts arrive.
                 self.settings.set(setting, text)
             }
         }

@@ -21,8 +21,8 @@ use crate::supervisor::{Confinement, PluginEvent, Restart, Supervisor};
 
 /// Time in which a plugin that reported a failure may still print the reason, before it is restarted. [s]
 const LAST_WORDS_S: f64 = 0.3;
-/// Silence of an attached plugin after which the vehicle holds. Shorter than the guard's 0.5 s, after which the vehicle
-/// would land later. [s]
+/// Silence of an attached plugin after which the vehicle holds. Shorter than the guard's 0.5 s of silence, after which
+/// the vehicle would hold and later land. [s]
 const BREAKPOINT_S: f64 = 0.4;
 
 /// State of the plugin, once the arena is known.

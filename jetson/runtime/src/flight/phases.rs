@@ -9,7 +9,7 @@ use super::{Flight, LinkView, Orders};
 use crate::guard::{Guard, GuardMode, GuardOutput, HoldReason, Lagging, Slowed};
 
 /// Share of the take-off height that counts as reached: near the height ArduCopter slows down, and hands over at 0.9 m
-/// of a metre.
+/// of a 1 m take-off.
 const REACHED: f64 = 0.9;
 /// Maximum measured speed of a vehicle at rest. [m/s]
 const AT_REST_MPS: f64 = 0.3;
@@ -217,7 +217,7 @@ impl Flight {
         }
     }
 
-    /// Reports that old images slow the vehicle down; again only after [`REMIND_S`] at full speed.
+    /// Reports that old images slow the vehicle down; again only after [`REMIND_S`] without slowing.
     fn notice_slowed(&mut self, now: HostTime, Slowed { age_s, share }: Slowed) {
         let former = self.slowed_at.replace(now);
         if former.is_none_or(|at| now.seconds_since(at) > REMIND_S) {
@@ -236,7 +236,7 @@ impl Flight {
             let text = "the vehicle answers in time: flown at the full speed limit";
             return self.notice(EventKind::Note, text.to_owned());
         };
-        let knows = if measured { "answers" } else { "may answer (response unknown)" };
+        let knows = if measured { "answers" } else { "may answer (not measured yet)" };
         let text = format!(
             "the vehicle {knows} {:.1} s late: flown at {:.0} % of the speed limit; ArduCopter answers sooner with \
              PSC_JERK_NE and PSC_JERK_D (before 4.7: PSC_JERK_XY, PSC_JERK_Z) of 20, as `vizflyt doctor vehicle --apply` sets",

@@ -26,7 +26,7 @@ const MAX_TILT_RAD: f64 = 1.0;
 /// Maximum ratio of thrust to weight; small quadrotors have 2 to 5.
 const MAX_THRUST: f64 = 4.0;
 
-/// Setpoint resolved relative to the vehicle's motion at its first tick.
+/// Setpoint resolved relative to the vehicle's motion at its first tick, or continued from the setpoint before.
 #[derive(Clone, Debug, Default)]
 pub(super) enum Resolved {
     /// Not resolved yet, or nothing to resolve.

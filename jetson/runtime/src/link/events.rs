@@ -18,7 +18,7 @@ pub enum LinkEvent {
         /// System id of the autopilot.
         system: u8,
     },
-    /// No heartbeat for 3 s.
+    /// No packet of the autopilot for 3 s.
     Lost,
     /// The autopilot restarted.
     Rebooted,

@@ -77,7 +77,8 @@ pub enum EndReason {
     },
     /// An earlier runtime left the vehicle in the air.
     LeftInAir,
-    /// The connection to the server failed permanently; the text gives the reason.
+    /// The server rejected the flight, the connection failed permanently, or the plugin's shared memory cannot be
+    /// created; the text gives the reason.
     ServerRefused(Text),
     /// The arena is invalid for a flight; the text names the value and the reason.
     ArenaRefused(Text),
@@ -208,7 +209,7 @@ pub enum Missing {
     Pose,
     /// First answer of the plugin.
     Answer,
-    /// Pre-arm checks of the autopilot; with the failed check.
+    /// Pre-arm checks of the autopilot; with the missing condition, in words.
     PreArm(Text),
     /// Connection to the server; with the last error.
     Connection(Text),

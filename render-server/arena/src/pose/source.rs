@@ -356,7 +356,8 @@ impl Claim {
             && leads(self.first_off_rad, off_rad, FITS_SIGMAS * noise_rad, MAX_TURN_RADPS)
     }
 
-    /// Whether the deviation grows as in a motion that began after the last accepted pose.
+    /// Whether the deviation is at least [`GROWS`] times the first, as in a motion that began after the last accepted
+    /// pose.
     pub(super) fn grows_to(&self, surprise: &Surprise) -> bool {
         let Surprise { off_m, off_rad, .. } = surprise;
         if self.is_turned {

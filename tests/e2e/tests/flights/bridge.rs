@@ -298,7 +298,9 @@ fn firmware_update_over_the_network_is_verified_as_on_a_chip() {
     check(&sign("esp32c3", "8"), false, "another chip");
     check(&image, false, "is not signed");
     // Flip one bit of the program, then one of the signature.
-    for (place, expected) in [(150_000, "differ from the signed firmware"), (60, "signature is not of")] {
+    for (place, expected) in
+        [(150_000, "differ from the signed firmware"), (60, "signature is not of")]
+    {
         let mut bytes = std::fs::read(&seven).unwrap();
         bytes[place] ^= 1;
         let damaged = at("damaged.signed");

@@ -49,9 +49,10 @@ fn keys_are_kept_made_for_new_vehicles_and_checked() {
     assert_eq!(again.links("", &["ant"]), first);
     assert_eq!(again.links("", &["ant", "a 'b", "bee"]).len(), 3);
     let good = folder.read_secret(FILE).unwrap().unwrap();
-    for (from, to, expected) in
-        [("instructor", "boss", "unknown field"), ("ant = \"", "ant = \"short\" # ", "a key has 16")]
-    {
+    for (from, to, expected) in [
+        ("instructor", "boss", "unknown field"),
+        ("ant = \"", "ant = \"short\" # ", "a key has 16"),
+    ] {
         folder.write(FILE, &good.replace(from, to)).unwrap();
         let error = PageKeys::keep(&folder, &["ant"]).unwrap_err().to_string();
         assert!(error.contains(expected), "{error}");

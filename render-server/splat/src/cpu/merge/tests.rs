@@ -111,7 +111,7 @@ fn area_is_the_mean_projected_area() {
 
 #[test]
 fn two_distant_splats_cover_no_more_than_two() {
-    // 22 m apart, with deviations of 1.7 cm, seen at a distance at which a pixel is 30 cm.
+    // 22 m apart, with deviations of 0.3 mm, seen at a distance at which a pixel is 30 cm.
     let points =
         [0.0, 22.0].map(|z| Blob::new(DVec3::new(0.0, 0.0, z), DMat3::IDENTITY * 3e-4, 0.7));
     let merged = merge(points.into_iter(), 0.09);
