@@ -12,7 +12,7 @@ use vizflyt_runtime::args::LogArgs;
 use crate::lab::{self, LabArgs, LabFlight};
 use crate::plugins;
 
-/// Fly a simulated drone on this machine: scene, vehicle, plugin and web page
+/// Fly a simulated drone here: scene, vehicle, plugin, web page
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt demo                                  fly the forest and watch it in the browser

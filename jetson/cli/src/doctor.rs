@@ -21,7 +21,7 @@ use vizflyt_server::web::Evidence;
 use crate::server_page::ServerPage;
 use crate::vehicle::AutopilotArgs;
 
-/// Check a vehicle before flight: autopilot parameters, localization axes
+/// Check a vehicle before flight: parameters, localization axes
 #[derive(Args, Debug)]
 pub(crate) struct DoctorArgs {
     #[command(subcommand)]

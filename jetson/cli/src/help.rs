@@ -115,12 +115,14 @@ mod tests {
         fn check(command: &Command, path: &str) {
             let about = command.get_about().map(ToString::to_string).unwrap_or_default();
             assert!((1..=COLUMNS).contains(&about.chars().count()), "{path}: {about}");
-            for argument in command.get_arguments() {
+            for argument in command.get_arguments().filter(|argument| !argument.is_hide_set()) {
                 let help = argument.get_help().map(ToString::to_string).unwrap_or_default();
                 let length = help.chars().count();
                 assert!((1..=COLUMNS).contains(&length), "{path} {}: {help}", argument.get_id());
             }
-            for subcommand in command.get_subcommands() {
+            for subcommand in
+                command.get_subcommands().filter(|subcommand| !subcommand.is_hide_set())
+            {
                 check(subcommand, &format!("{path} {}", subcommand.get_name()));
             }
         }

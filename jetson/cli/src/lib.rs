@@ -66,11 +66,11 @@ struct Cli {
 #[derive(Subcommand, Debug)]
 #[allow(clippy::large_enum_variant)] // Why: only one value exists, for a short time.
 enum Command {
-    /// Fly a simulated drone on this machine: scene, vehicle, plugin and web page
+    /// Fly a simulated drone here: scene, vehicle, plugin, web page
     Demo(demo::DemoArgs),
     /// Make a folder with a plugin that flies
     New(new::NewArgs),
-    /// Fly a plugin in the simulated lab, or in the real one if it is configured
+    /// Fly a plugin in the simulated lab, or in the configured real one
     Fly(fly::FlyArgs),
     /// Fly a course once per seed in lock-step, and score the plugin
     Grade(vizflyt_grading::GradeArgs),
@@ -78,14 +78,14 @@ enum Command {
     Submit(class::SubmitArgs),
     /// Grade every team of a class, and write one table of results
     GradeClass(class::ClassArgs),
-    /// Run courses for reinforcement learning; started by Python's `vizflyt.Env`
+    /// Run courses for Python's reinforcement-learning environments
     Gym(vizflyt_gym::GymArgs),
-    /// Run the render server: poses in, RGB-D images out, web page and events
+    /// Run the render server: poses in; images, web page, events out
     Serve(vizflyt_server::ServeArgs),
     /// Pair this computer with a render server by a short code
     Pair(pair::PairArgs),
     Password(password::PasswordArgs),
-    /// Check a vehicle before flight: autopilot parameters, localization axes
+    /// Check a vehicle before flight: parameters, localization axes
     Doctor(doctor::DoctorArgs),
     #[cfg(feature = "crazyflie")]
     Crazyflie(crazyflie::CrazyflieArgs),
@@ -104,14 +104,14 @@ enum Command {
     Scene(scene::SceneArgs),
     Arena(arena::ArenaArgs),
     Tags(tags::TagsArgs),
-    /// Measure this machine: rendering, streaming, decoding, bridge latency
+    /// Measure this machine: rendering, streaming, decoding, bridge
     Bench(bench::BenchArgs),
     /// Show the latency of images by stage, and why images were skipped
     Stats(stats::StatsArgs),
     Evaluate(evaluate::EvaluateArgs),
     Export(export::ExportArgs),
     Dataset(Box<dataset::DatasetArgs>),
-    /// Feed recorded images to a plugin, and report where its answers differ
+    /// Feed recorded images to a plugin, and compare its answers
     Replay(replay::ReplayArgs),
     /// Open the documentation in a browser, without the internet
     Docs(docs::DocsArgs),

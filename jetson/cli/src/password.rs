@@ -10,7 +10,7 @@ use nix::sys::termios::{LocalFlags, SetArg, Termios, tcgetattr, tcsetattr};
 use vizflyt_process::{print_error, print_line};
 use vizflyt_trust::KeysFolder;
 
-/// Set the password with which the instructor logs in on the server's page
+/// Set the instructor's password for the server's page
 ///
 /// Run this command on the server's computer. A running server uses the new password immediately
 /// and ends all sessions of the old one.

@@ -21,7 +21,7 @@ use vizflyt_runtime::replay::{
 };
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 
-/// Feed recorded images to a plugin, and report where its answers differ
+/// Feed recorded images to a plugin, and compare its answers
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
   vizflyt replay flights/2026-11-21T04-09-21.123Z.mcap

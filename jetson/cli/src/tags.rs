@@ -11,7 +11,7 @@ use anyhow::Result;
 use clap::{Args, Subcommand};
 use vizflyt_tags::family::TagFamily;
 
-/// Localize the vehicle by AprilTags: print, calibrate, survey, locate
+/// Localize by AprilTags: print, calibrate, survey, locate
 #[derive(Args, Debug)]
 #[command(after_help = "Steps:
   vizflyt tags print cube -o cube.pdf       cube for the vehicle; `print mat` for the floor

@@ -77,7 +77,7 @@ mod tests {
         let subject = subject();
         let (one, two) = (part(&subject, 1, 2, &[1, 3]), part(&subject, 2, 2, &[2, 4]));
         refused(&[], "nothing");
-        refused(std::slice::from_ref(&one), "missing: 2");
+        refused(std::slice::from_ref(&one), "missing parts of 2: 2");
         refused(&[one.clone(), one.clone(), two.clone()], "twice");
         refused(&[one.clone(), part(&subject, 2, 3, &[2, 4])], "is part of 3");
         refused(&[one.clone(), part(&subject, 2, 2, &[2, 5])], "every flight once");

@@ -99,7 +99,7 @@ fn merged_shards_equal_the_complete_grade() {
         assert_eq!(part["runs"].as_array().unwrap().len(), 1);
         file
     });
-    rig.refused(&["merge", &parts[0]], "missing: 2");
+    rig.refused(&["merge", &parts[0]], "missing parts of 2: 2");
     let whole = rig.at("whole.json");
     let report = rig.at("merged");
     rig.good(&["merge", &parts[1], &parts[0], "-o", &whole, "--report", &report]);

@@ -15,7 +15,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 
-/// Measure this machine: rendering, streaming, decoding, bridge latency
+/// Measure this machine: rendering, streaming, decoding, bridge
 #[derive(Args, Debug)]
 pub(crate) struct BenchArgs {
     #[command(subcommand)]

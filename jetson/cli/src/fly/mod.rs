@@ -13,7 +13,7 @@ use vizflyt_server::scene::BareArgs;
 
 use crate::lab::{self, LabArgs, LabFlight};
 
-/// Fly a plugin in the simulated lab, or in the real one if it is configured
+/// Fly a plugin in the simulated lab, or in the configured real one
 ///
 /// The real lab is used if `jetson.toml` or --server names a render server.
 ///

@@ -19,7 +19,7 @@ use self::pairs::Pair;
 pub use self::pairs::{Association, associate, interpolated};
 pub use self::trajectory::{Stamped, read};
 
-/// Measure the absolute and relative errors of an estimated trajectory
+/// Measure absolute and relative errors of a trajectory
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt evaluate truth.tum odometry.tum --align se3

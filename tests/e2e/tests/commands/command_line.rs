@@ -77,7 +77,7 @@ fn errors_of_evaluate_name_the_cause() {
 fn errors_name_the_cause() {
     check_refused(
         &["demo", "--scene", "forrest"],
-        &["forrest", "no generated scene (forest, race"],
+        &["forrest", "neither a generated scene (forest, race"],
     );
     check_refused(&["scene", "generate", "swamp", "-o", "x"], &["swamp", "forest"]);
     check_refused(&["serve", "/nowhere/arena.toml"], &["/nowhere/arena.toml"]);
@@ -96,7 +96,7 @@ fn errors_name_the_cause() {
     );
     let scene = folder.path().join("room.ply");
     std::fs::write(&scene, [0xff; 64]).unwrap();
-    check_refused(&["arena", "check", scene.to_str().unwrap()], &["room.ply is no arena.toml"]);
+    check_refused(&["arena", "check", scene.to_str().unwrap()], &["room.ply is not an arena.toml"]);
 }
 
 #[test]
