@@ -498,13 +498,19 @@ fn on_the_leaderboard(rig: &Rig, whole: &str, part: &str) {
     for team in ["wasps", "bees"] {
         leaderboard(rig, &["team", "add", team]).unwrap();
     }
-    refused(part, "--team=wasps", "part 1 of 2 of a grade; `vizflyt grade merge`");
+    refused(
+        part,
+        "--team=wasps",
+        "part 1 of 2 of a grade; combine all parts with `vizflyt grade merge`",
+    );
     let others = format!("--keys={}", rig.at("others"));
     let error = leaderboard(rig, &["add", whole, "--team=wasps", &others]).unwrap_err();
     assert!(error.contains("is signed with the key"), "{error}");
     let printed = add(whole, "--team=wasps").unwrap();
     assert!(
-        printed.contains("of team 'wasps' is added") && printed.contains("2 of 2   finished"),
+        printed.starts_with("added grade ")
+            && printed.contains("of team 'wasps'")
+            && printed.contains("2 of 2   finished"),
         "{printed}"
     );
     refused(whole, "--team=wasps", "already: team 'wasps' has added it");

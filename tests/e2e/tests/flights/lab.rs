@@ -21,7 +21,7 @@ use glam::DVec3;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
-use vizflyt_e2e::vizflyt;
+use vizflyt_e2e::{Load, vizflyt};
 use vizflyt_protocol::mavlink::StreamDecoder;
 use vizflyt_protocol::mavlink::dialect::{MavCmd, MavMessage};
 use vizflyt_trust::{Client, Fingerprint, Identity, KeysFolder, Owner, Paired, Role};
@@ -356,17 +356,42 @@ impl Lab {
 impl Flight {
     /// Waits until the runtime prints a line that contains `text`; returns all lines up to it.
     pub(crate) fn until(&mut self, text: &str) -> Vec<(Instant, Value)> {
+        let how = self.how;
+        self.try_until(text)
+            .unwrap_or_else(|lines| panic!("{how}: no line with {text}: {lines:#?}"))
+    }
+
+    /// Like [`Self::until`]; `None` if the machine was too busy for the flight, by the measurement `load`.
+    pub(crate) fn until_unless_busy(
+        &mut self,
+        text: &str,
+        load: &Load,
+    ) -> Option<Vec<(Instant, Value)>> {
+        match self.try_until(text) {
+            Ok(lines) => Some(lines),
+            Err(lines) => {
+                assert!(load.is_too_high(), "{}: no line with {text}: {lines:#?}", self.how);
+                println!(
+                    "the machine is too busy: a safety rule landed the vehicle before the test began"
+                );
+                None
+            }
+        }
+    }
+
+    /// Waits for a line with `text`; returns all lines up to it, or all of the flight's if there is none.
+    fn try_until(&mut self, text: &str) -> Result<Vec<(Instant, Value)>, Vec<(Instant, Value)>> {
         let mut lines = Vec::new();
         let deadline = Instant::now() + PATIENCE;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
             let Ok(line) = self.runtime.lines.recv_timeout(left) else {
-                panic!("{}: no line with {text}: {lines:#?}", self.how)
+                return Err(lines);
             };
             let is_it = line.1.to_string().contains(text);
             lines.push(line);
             if is_it {
-                return lines;
+                return Ok(lines);
             }
         }
     }
