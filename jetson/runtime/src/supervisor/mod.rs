@@ -19,7 +19,7 @@ use std::ffi::OsString;
 use std::io;
 use std::os::unix::process::ExitStatusExt;
 use std::process::{Child, ExitStatus, Stdio};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError, mpsc};
 use std::thread;
 use std::time::Duration;
 use vizflyt_process::lock;
@@ -79,6 +79,8 @@ struct SharedState {
     occupation: Mutex<Occupation>,
 }
 
+/// Maximum delay of the report of the end, for the last lines on standard error.
+const LAST_LINE_WITHIN: Duration = Duration::from_millis(100);
 /// Timeout of each step of an orderly end.
 const END_WITHIN: Duration = Duration::from_millis(300);
 /// Period at which limits and occupation are sampled: a leak of 2 GB/s adds 200 MB.
@@ -132,6 +134,8 @@ impl Supervisor {
                 read_lines(stdout, |line| handle(PluginEvent::Line(Stream::Stdout, line)));
             })?;
         }
+        // Disconnected when standard error has been read to its end.
+        let (reading, is_read) = mpsc::channel::<()>();
         if let Some(stderr) = child.stderr.take() {
             let (handle, shared) = (handle.clone(), Arc::clone(&shared));
             let mut tracebacks = Tracebacks::new(confinement.own_folders().to_vec());
@@ -144,12 +148,13 @@ impl Supervisor {
                     tracebacks.take(line, &mut handle);
                 });
                 tracebacks.end(&mut handle);
+                drop(reading);
             })?;
         }
         let watched = Arc::clone(&shared);
         spawn("plugin-watch", move || watched.watch())?;
         let waited = Arc::clone(&shared);
-        spawn("plugin-wait", move || waited.wait(child, &handle))?;
+        spawn("plugin-wait", move || waited.wait(child, &is_read, &handle))?;
         Ok(Self { shared })
     }
 
@@ -247,12 +252,12 @@ impl SharedState {
     }
 
     /// Waits for the end of the process, kills its remaining descendants, and reports the end.
-    fn wait(&self, mut child: Child, handle: &impl Fn(PluginEvent)) {
+    fn wait(&self, mut child: Child, is_read: &mpsc::Receiver<()>, handle: &impl Fn(PluginEvent)) {
         let status = child.wait();
         // Remaining descendants would keep the pipes open and use the processor.
         self.kill();
-        // Another thread reads the last lines from a pipe and has usually stored them by this time.
-        // Waiting for them would delay the landing.
+        // The last line is the cause in words. On a busy machine, the thread that reads it needs some time.
+        let _ = is_read.recv_timeout(LAST_LINE_WITHIN);
         let last = lock(&self.last_error).clone();
         let kill_reason = lock(&self.kill_reason).take();
         let sentence = match &status {
