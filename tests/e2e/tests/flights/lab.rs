@@ -70,6 +70,9 @@ struct Bridge {
     uart: PathBuf,
 }
 
+/// Lines of the runtime, with their times of arrival.
+pub(crate) type Lines = Vec<(Instant, Value)>;
+
 /// A running flight.
 pub(crate) struct Flight {
     /// Request to the plugin.
@@ -95,7 +98,7 @@ pub(crate) struct Flight {
 /// Observations of a flight.
 pub(crate) struct Seen {
     /// JSON lines of the runtime, with their times.
-    pub lines: Vec<(Instant, Value)>,
+    pub lines: Lines,
     /// Positions by motion capture, also while its poses are cut. [m, world]
     pub track: Vec<Sight>,
     /// Modes of the vehicle, with their start.
@@ -355,18 +358,14 @@ impl Lab {
 
 impl Flight {
     /// Waits until the runtime prints a line that contains `text`; returns all lines up to it.
-    pub(crate) fn until(&mut self, text: &str) -> Vec<(Instant, Value)> {
+    pub(crate) fn until(&mut self, text: &str) -> Lines {
         let how = self.how;
         self.try_until(text)
             .unwrap_or_else(|lines| panic!("{how}: no line with {text}: {lines:#?}"))
     }
 
     /// Like [`Self::until`]; `None` if the machine was too busy for the flight, by the measurement `load`.
-    pub(crate) fn until_unless_busy(
-        &mut self,
-        text: &str,
-        load: &Load,
-    ) -> Option<Vec<(Instant, Value)>> {
+    pub(crate) fn until_unless_busy(&mut self, text: &str, load: &Load) -> Option<Lines> {
         match self.try_until(text) {
             Ok(lines) => Some(lines),
             Err(lines) => {
@@ -380,7 +379,7 @@ impl Flight {
     }
 
     /// Waits for a line with `text`; returns all lines up to it, or all of the flight's if there is none.
-    fn try_until(&mut self, text: &str) -> Result<Vec<(Instant, Value)>, Vec<(Instant, Value)>> {
+    fn try_until(&mut self, text: &str) -> Result<Lines, Lines> {
         let mut lines = Vec::new();
         let deadline = Instant::now() + PATIENCE;
         loop {
