@@ -276,7 +276,9 @@ def check_images(stage, inboxes):
         matrix = np.reshape(info.k, (3, 3))
         check(np.allclose(matrix, stage.intrinsics.opencv_matrix, atol=1e-12), f"{name}: K is {matrix}")
         check((info.width, info.height, len(info.d)) == (WIDTH, HEIGHT, 5), f"{name}: {info}")
-        check(set(stamps) <= {found.stamp_ns() for found in inboxes[name].found}, f"{name} lacks images' stamps")
+        # Best effort, as images are: a busy machine loses some of either, but they have the same stamps.
+        common = set(stamps) & {found.stamp_ns() for found in inboxes[name].found}
+        check(len(common) >= len(stamps) / 2, f"{name} has {len(common)} of {len(stamps)} images' stamps")
 
 
 def turn(q):
