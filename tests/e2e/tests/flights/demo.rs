@@ -381,7 +381,7 @@ fn flies_in_a_packed_scene() {
     assert_eq!(good(&["arena", "check", &arena]), in_memory);
     check_refused(&["scene", "inspect", &packed], &["a packed scene", "that it was packed from"]);
 
-    let mut demo = file.demo(&["--scene", &forest, "--seconds", "12"]);
+    let mut demo = file.demo(&["--scene", &forest, "--seconds", "8"]);
     demo.wait(FLIGHT);
     let report = file.read();
     assert!(report["renderer"].as_str().unwrap().ends_with("streamed"), "{report:#}");
