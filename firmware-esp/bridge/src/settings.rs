@@ -354,7 +354,7 @@ pub fn key_to_hex(key: &Key) -> String<64> {
 }
 
 /// Returns a key for typing, with 80 random bits: four groups of four letters and digits that are easy to distinguish.
-/// It is used as network password and as key of the web page.
+/// The key is used as network password and as key of the web page.
 pub fn typed_key(random: &[u8; 16]) -> String<19> {
     const LETTERS: &[u8; 32] = b"abcdefghijkmnpqrstuvwxyz23456789";
     let mut key = String::new();

@@ -85,7 +85,7 @@ pub struct SimArgs {
     pub radio: bool,
     /// Motor (1 to 4, ArduCopter's order) that fails, and time after take-off [s]
     ///
-    /// It then gives PERCENT of its thrust, or nothing if PERCENT is absent.
+    /// The motor then gives PERCENT of its thrust, or nothing if PERCENT is absent.
     #[arg(long, help_heading = "Faults", value_name = "MOTOR@SECONDS[,PERCENT]", value_parser = parse_motor_fault)]
     pub motor_failure: Option<MotorFault>,
     /// Time after take-off at which the transmitter falls silent [s]

@@ -149,7 +149,8 @@ pub struct PluginConfig {
     pub restarts: Option<u32>,
     /// Whether the plugin may use the network.
     pub network: bool,
-    /// User of the plugin's process if the runtime is root. Default: `vizflyt`, or `nobody` if there is no such user.
+    /// User of the plugin's process if the runtime is root. Default: the account `vizflyt`, or `nobody` if it
+    /// does not exist.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub user: Option<String>,
     /// Folders that the plugin may write to, in addition to its own folder, the working folder and `/tmp`.

@@ -27,7 +27,7 @@ use vizflyt_splat::{
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
 
-/// Thread pool that counts only the allocations of its own threads, because tests run concurrently in one process.
+/// Thread pool that counts only the allocations of its threads, because tests run concurrently in one process.
 struct Pool {
     threads: ThreadPool,
     count: &'static AtomicUsize,

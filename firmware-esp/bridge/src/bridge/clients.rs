@@ -41,7 +41,7 @@ pub(crate) struct Client {
     pub pending: u32,
     /// Arrival time of the oldest pending packet.
     pub since: HostTime,
-    /// When the client last accepted data, or had none pending.
+    /// Time at which the client last accepted data, or had none pending.
     pub taken_at: HostTime,
     /// Whether a pending packet must be sent at once.
     pub hurry: bool,

@@ -30,7 +30,7 @@ pub enum Event {
 pub(super) struct OutstandingRequests {
     /// Pending TIMESYNC requests: `ts1`, and when they were forwarded.
     syncs: heapless::Deque<(i64, HostTime), 4>,
-    /// When a client last sent TIMESYNC; a recent one makes the bridge's own unnecessary.
+    /// Time of the last TIMESYNC of a client. After a recent one, the bridge sends none.
     pub(super) client_asked_at: Option<HostTime>,
     pub(super) access: Access,
 }

@@ -52,9 +52,9 @@ pub(super) struct PacketRouter {
     pub(super) failsafe: Failsafe,
     pub(super) signing: VehicleSigning,
     pub(super) typed: TypedTexts,
-    /// When changed settings are saved.
+    /// Time at which changed settings are saved.
     pub(super) save_at: Option<HostTime>,
-    /// When the generated password is next announced.
+    /// Time of the next announcement of the generated password.
     pub(super) tell_key_at: Option<HostTime>,
     /// Until then, the browser's form rejects every key.
     pub(super) form_opens_at: HostTime,

@@ -214,7 +214,7 @@ impl PluginProcess {
         }
     }
 
-    /// Whether the plugin has taken more than `within` of its own time; samples it periodically.
+    /// Whether the plugin's [own time](OwnTime) exceeds `within`. Samples it periodically.
     fn has_taken(&self, time: &mut OwnTime, within: Duration) -> Result<bool, ProcessError> {
         if time.is_due(Instant::now()) {
             let sample = look(self.supervisor.id());

@@ -36,7 +36,8 @@ pub struct PluginLimits {
     pub restarts: u32,
     /// Whether the plugin may use the network.
     pub network: bool,
-    /// User that the plugin runs as if the runtime is root. Default: `vizflyt`, or else `nobody`.
+    /// User that the plugin runs as if the runtime is root. Default: the account `vizflyt`, or `nobody`
+    /// if it does not exist.
     pub user: Option<String>,
     /// Writable folders in addition to the plugin's own, the working folder and `/tmp`.
     pub write: Vec<PathBuf>,

@@ -85,7 +85,7 @@ proptest! {
     }
 }
 
-/// Returns a square wall of opaque splats, perpendicular to the z axis of its own frame.
+/// Returns a square wall of opaque splats, perpendicular to the z axis of its frame.
 fn wall(z_m: f32, half_m: f32, colour: f32) -> Splats {
     let mut splats = Splats::default();
     for y in -20..=20i16 {

@@ -177,7 +177,7 @@ fn a_reboot_in_flight_drops_the_vehicle_and_restarts_its_clock() {
     let Some(MavMessage::ATTITUDE(m)) = c.newest.get(&30) else { panic!() };
     assert!(m.time_boot_ms < 4000, "{}", m.time_boot_ms);
     assert!(!c.armed() && c.mode() == CopterMode::Stabilize);
-    // It has lost the origin, but kept its parameters.
+    // The autopilot has lost the origin, but kept its parameters.
     let health = c.lab.autopilot().estimator().health(c.lab.autopilot_now());
     assert!(health.attitude && !health.origin);
     c.set_origin();

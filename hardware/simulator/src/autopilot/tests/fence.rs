@@ -138,7 +138,7 @@ fn a_no_fly_box_lands_the_vehicle_at_its_edge() {
     assert_eq!((m.breach_count, m.breach_type), (1, FenceBreach::FENCE_BREACH_BOUNDARY));
     c.until(15.0, "the disarm", |c| !c.armed());
     assert!(c.p().x < 2.0, "{:?}", c.p());
-    // It now stands in the box, so arming is refused.
+    // The vehicle stands in the box, so arming is refused.
     assert_eq!(c.set_mode(CopterMode::Guided), ACCEPTED);
     assert_eq!(c.arm(), FAILED);
 }

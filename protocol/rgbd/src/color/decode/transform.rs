@@ -123,8 +123,8 @@ pub(super) fn samples(rows: &[Lanes; 8]) -> [[Sample; 8]; 8] {
     out
 }
 
-/// Doubles a row of chroma in both directions. A pixel is the weighted mean of its own sample (weight 9), the nearest
-/// horizontal and vertical neighbours (3 each) and the diagonal one (1). `far` is the nearest row above or below;
+/// Doubles a row of chroma in both directions. A pixel is the weighted mean of the sample at its place (weight 9), the
+/// nearest horizontal and vertical neighbours (3 each) and the diagonal one (1). `far` is the nearest row above or below;
 /// `sums` has space for the length of a row plus two.
 #[inline(always)]
 pub(super) fn double_row(near: &[Sample], far: &[Sample], sums: &mut [u16], out: &mut [Sample]) {

@@ -5,7 +5,7 @@
 //! newest motions, splats for ray queries ─────────────────┘        │ thread (wall clock), graded flights
 //!                                                                  └▶ newest reading of each, to sessions and the page
 //! ```
-//! Policy: images have priority. The thread uses at most one core, of its own pool, and skips readings that it
+//! Policy: images have priority. The thread uses at most one core, from a separate pool, and skips readings that it
 //! cannot make in time: a late sensor's next reading is counted from then on. It rests without demand for a
 //! vehicle's images, and is not started in an arena without sensors.
 //!
