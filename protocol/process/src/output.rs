@@ -4,6 +4,7 @@
 //! commands that fly or serve call [`never_wait_for_readers`] first: from then on text goes through bounded queues to
 //! one thread per stream, and text that finds its queue full is dropped and counted.
 
+use std::backtrace::{Backtrace, BacktraceStatus};
 use std::fmt::Display;
 use std::io::Write;
 use std::sync::OnceLock;
@@ -83,7 +84,17 @@ impl Write for LogWriter {
 /// If a thread cannot be started.
 pub fn never_wait_for_readers() {
     QUEUES.get_or_init(|| [OutputStream::Out, OutputStream::Error].map(start));
-    std::panic::set_hook(Box::new(|panic| print_error(panic)));
+    std::panic::set_hook(Box::new(|panic| {
+        let thread = std::thread::current();
+        let name = thread.name().unwrap_or("unnamed");
+        // Empty unless RUST_BACKTRACE is set, as in the standard hook.
+        let backtrace = Backtrace::capture();
+        let text = match backtrace.status() {
+            BacktraceStatus::Captured => format!("\n{backtrace}"),
+            _ => String::new(),
+        };
+        print_error(format_args!("thread '{name}' {panic}{text}"));
+    }));
 }
 
 /// Waits until queued text has been written, for half a second per stream at most.
