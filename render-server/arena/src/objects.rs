@@ -80,7 +80,7 @@ impl MovingObjects {
     ///     motion: Some(MotionConfig::Rotation { axis: DVec3::X, period_s: 4.0 }),
     /// };
     /// let objects = MovingObjects::of(&[hand], 7);
-    /// A quarter of a turn later, the direction that pointed up points to -y.
+    /// // A quarter of a turn later, the direction that pointed up points to -y.
     /// let pose = objects.placements(1_000_000_000)[0].unwrap();
     /// assert!((pose.rotate(DVec3::Z) - DVec3::NEG_Y).length() < 1e-12);
     /// ```

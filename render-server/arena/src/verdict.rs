@@ -91,7 +91,7 @@ pub struct Verdict {
 /// # horizontal_fov_deg = 90.0
 /// # position_m = [0.06, 0, 0.02]
 /// # "#).unwrap();
-/// No event and no sample: the vehicle never took off.
+/// // No event and no sample: the vehicle never took off.
 /// let verdict = judge(&arena, &[], &[]);
 /// assert_eq!((verdict.outcome, verdict.score), (OutcomeKind::Error, 0.0));
 /// ```

@@ -19,7 +19,7 @@ pub use weather::{
 /// ```
 /// use vizflyt_arena::config::EnvironmentConfig;
 /// let fog = EnvironmentConfig::named("fog").unwrap();
-/// At the visibility range, the contrast has lost 98 %.
+/// // At the visibility range, the contrast has lost 98 %.
 /// let left = (-fog.fog_per_m() * fog.fog_visibility_m).exp();
 /// assert!((left - 0.02).abs() < 1e-9);
 /// assert_eq!(fog.name(), Some("fog"));
