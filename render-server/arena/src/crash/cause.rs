@@ -36,28 +36,20 @@ pub fn probable_cause(
 
 fn of_plugin(flight: &Flight<'_>, fault: &PluginFault) -> String {
     let reason = &flight.verdict.reason;
-    // A flight ends after two seconds without a setpoint. Were there replies in this time?
-    let answers = flight.asked.unwrap_or_default();
-    let newest = answers.last().zip(flight.verdict.ended);
-    if let Some((asked, at)) = newest
-        && at.seconds_since(asked.stamp) < SILENT_S
-        && matches!(fault, PluginFault::NoSetpoint | PluginFault::NoAnswer { .. })
-    {
-        let since = answers.iter().rev().find(|asked| asked.setpoint.is_some());
-        return match since {
-            Some(asked) => format!(
-                "it answers images, but for {:.1} s without a setpoint: what does it wait for?",
-                at.seconds_since(asked.stamp)
-            ),
-            None => {
-                "it answers images, but never with a setpoint: is this the course it is made for?"
-                    .to_owned()
-            }
-        };
-    }
     match (fault, flight.last_line) {
         (PluginFault::NoAnswer { .. }, _) => {
             format!("no answer: {reason}; does `on_image` wait for something, or loop?")
+        }
+        (PluginFault::NoSetpoint, _) if let Some(answers) = flight.asked => {
+            let newest = answers.iter().rev().find(|asked| asked.setpoint.is_some());
+            match newest.zip(flight.verdict.ended) {
+                Some((asked, at)) => format!(
+                    "it answers images, but for {:.1} s without a setpoint: what does it wait for?",
+                    at.seconds_since(asked.stamp)
+                ),
+                None => "it answers images, but never with a setpoint: is this the course it is made for?"
+                    .to_owned(),
+            }
         }
         (PluginFault::Refused(_), _) => {
             format!("its setpoints are invalid: {reason}")
