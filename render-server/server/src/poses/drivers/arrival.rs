@@ -22,6 +22,8 @@ use crate::clock;
 pub(super) struct Arrivals {
     /// Buffer for the kernel's stamp.
     control: Vec<u8>,
+    /// Arrival time of the last datagram. [server]
+    last: ServerTime,
 }
 
 /// Length, sender and arrival time of a datagram.
@@ -38,7 +40,7 @@ impl Arrivals {
     /// Enables kernel stamps for `socket`. If they are unavailable, the time of reading is used.
     pub(super) fn of(socket: &UdpSocket) -> Self {
         let _ = setsockopt(socket, sockopt::ReceiveTimestampns, &true);
-        Self { control: cmsg_space!(TimeSpec) }
+        Self { control: cmsg_space!(TimeSpec), last: ServerTime::from_ns(0) }
     }
 
     /// Waits for the next datagram, at most for the socket's timeout.
@@ -62,11 +64,17 @@ impl Arrivals {
             ControlMessageOwned::ScmTimestampns(stamp) => Some(stamp),
             _ => None,
         });
-        let waited_s = stamp.map_or(0.0, waited_s);
-        let at = if waited_s < MAX_WAIT_S { now.plus_seconds(-waited_s) } else { now };
+        self.last = arrival_time(now, stamp.map_or(0.0, waited_s), self.last);
         let from = message.address.as_ref().and_then(address).ok_or(nix::Error::EAFNOSUPPORT)?;
-        Ok(Arrival { length: message.bytes, from, at })
+        Ok(Arrival { length: message.bytes, from, at: self.last })
     }
+}
+
+/// Returns the arrival time of a datagram that is read at `now` and has waited for `waited_s`. Datagrams arrive in
+/// order, so it is not before the arrival of the `last` one, even if the wall clock was set in between.
+fn arrival_time(now: ServerTime, waited_s: f64, last: ServerTime) -> ServerTime {
+    let at = if waited_s < MAX_WAIT_S { now.plus_seconds(-waited_s) } else { now };
+    at.max(last)
 }
 
 /// Returns the age of `stamp` on the wall clock, which the kernel uses for stamps. [s]
@@ -115,6 +123,16 @@ mod tests {
         socket.set_read_timeout(Some(Duration::from_millis(5))).unwrap();
         assert_eq!(arrivals.receive(&socket, &mut buffer).unwrap_err(), nix::Error::EAGAIN);
         worst_s
+    }
+
+    #[test]
+    fn wall_clock_that_is_set_makes_no_datagram_old() {
+        let at = |seconds| ServerTime::from_ns(0).plus_seconds(seconds);
+        assert_eq!(arrival_time(at(10.0), 0.2, at(9.0)), at(9.8));
+        // The wall clock was set forward by 0.5 s or an hour, or back, between stamp and reading.
+        assert_eq!(arrival_time(at(10.01), 0.5, at(10.0)), at(10.0));
+        assert_eq!(arrival_time(at(10.01), 3600.0, at(10.0)), at(10.01));
+        assert_eq!(arrival_time(at(10.01), 0.0, at(10.0)), at(10.01));
     }
 
     #[test]
