@@ -1,21 +1,14 @@
 //! A submission as a ZIP archive. Archives may be malicious: `open` rejects paths outside the
-//! archive, links, and more than [`MOST_BYTES`].
+//! archive, links, and more than [`MOST_BYTES`], and leaves out the same names as for a folder.
 
-use std::collections::BTreeMap;
 use std::io::{Cursor, Read, Write};
-use std::path::{Component, Path};
 
 use anyhow::{Context, Result, ensure};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-/// Maximum size of all files together. [bytes]
-pub const MOST_BYTES: u64 = 200 << 20;
-/// Maximum number of files.
-pub const MOST_FILES: usize = 5000;
-
-/// Files of a submission by path, with `/`.
-pub type Files = BTreeMap<String, Vec<u8>>;
+use crate::door;
+pub use crate::door::{Files, MOST_BYTES, MOST_FILES};
 
 /// Makes an archive; equal files give equal bytes.
 pub fn pack(files: &Files) -> Result<Vec<u8>> {
@@ -42,10 +35,7 @@ pub fn open(bytes: &[u8]) -> Result<Files> {
         if part.is_dir() {
             continue;
         }
-        let is_within = !name.contains(['\\', '\0'])
-            && !name.is_empty()
-            && Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));
-        ensure!(is_within, "'{}' leads out of the archive", name.escape_debug());
+        let Some(path) = door::path_of(&name)? else { continue };
         ensure!(part.is_file(), "'{}' is a link", name.escape_debug());
         // The size in the archive's header is not trusted.
         let mut content = Vec::new();
@@ -53,13 +43,8 @@ pub fn open(bytes: &[u8]) -> Result<Files> {
         left = left
             .checked_sub(content.len() as u64)
             .with_context(|| format!("the archive contains more than {MOST_BYTES} bytes"))?;
-        let name = Path::new(&name)
-            .components()
-            .map(|part| part.as_os_str().to_string_lossy())
-            .collect::<Vec<_>>()
-            .join("/");
         ensure!(
-            files.insert(name.clone(), content).is_none(),
+            files.insert(path, content).is_none(),
             "'{}' occurs twice",
             name.escape_debug()
         );
@@ -89,6 +74,9 @@ pub fn without_outer_folder(files: Files) -> Files {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+    use std::path::{Component, Path};
+
     use proptest::prelude::*;
 
     use super::*;
@@ -122,6 +110,16 @@ mod tests {
         archive.add_symlink("x", "/etc/passwd", SimpleFileOptions::default()).unwrap();
         let bytes = archive.finish().unwrap().into_inner();
         assert!(open(&bytes).unwrap_err().to_string().contains("'x' is a link"));
+    }
+
+    #[test]
+    fn leaves_out_settings_of_tools_and_build_output() {
+        let all = files(&[
+            "plugin.py", ".cargo/config.toml", "a/.cargo/config.toml", ".venv/bin/python3", "target/x",
+            "__pycache__/p.py", "a.pyc",
+        ]);
+        let found = open(&pack(&all).unwrap()).unwrap();
+        assert_eq!(found, files(&["plugin.py"]));
     }
 
     proptest! {

@@ -1,7 +1,7 @@
 //! A team's submission: files of the plugin's folder, packed by `vizflyt submit` and unpacked by
 //! `vizflyt grade-class`.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -12,17 +12,15 @@ use sha2::{Digest, Sha256};
 use vizflyt_process::print_fmt;
 use vizflyt_trust::hex;
 
-use super::archive::{Files, MOST_BYTES, MOST_FILES, open, pack, without_outer_folder};
+use super::archive::{MOST_BYTES, open, pack, without_outer_folder};
 use super::{hash, write};
+use crate::door::{self, Door};
 use crate::plugin::Plugin;
-
-/// Generated folders, which are not packed.
-const MADE: [&str; 4] = ["target", "__pycache__", "node_modules", "flights"];
 
 /// Pack the folder of a plugin for submission
 #[derive(Args, Debug)]
 #[command(
-    after_help = "Not packed: names that begin with a dot (.venv, .git), target, __pycache__, node_modules, flights,
+    after_help = "Not packed: names that begin with a dot (.venv, .git), target, venv, __pycache__, node_modules, flights,
 *.pyc and *.mcap. The same files give the same archive, so its SHA-256 identifies the submission.
 
 Examples:
@@ -42,7 +40,7 @@ pub fn submit(args: &SubmitArgs) -> Result<ExitCode> {
     let folder = &args.folder;
     ensure!(folder.is_dir(), "{} is not a folder; give the folder of the plugin", folder.display());
     Plugin::find(folder.as_os_str())?;
-    let files = read_folder(folder)?;
+    let files = Door::open(folder)?.files(&[])?;
     let bytes = pack(&files)?;
     let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_owned()));
     let output = args
@@ -67,9 +65,12 @@ pub(super) enum Submission {
 /// Finds the submission of a team.
 ///
 /// # Errors
-/// If there is none, or both a folder and an archive.
+/// If there is none, both a folder and an archive, or a link.
 pub(super) fn find(submissions: &Path, team: &str) -> Result<Submission> {
     let (folder, archive) = (submissions.join(team), submissions.join(format!("{team}.zip")));
+    for path in [&folder, &archive] {
+        ensure!(!path.is_symlink(), "{} is a link; replace it by its content", path.display());
+    }
     match (folder.is_dir(), archive.is_file()) {
         (true, true) => {
             bail!("{} and {} both exist; delete one of them", folder.display(), archive.display())
@@ -87,12 +88,11 @@ impl Submission {
     /// it.
     pub(super) fn sha256(&self) -> Result<String> {
         match self {
-            Self::Folder(folder) => Ok(hash(&pack(&read_folder(folder)?)?)),
+            Self::Folder(folder) => Ok(hash(&pack(&Door::open(folder)?.files(&[])?)?)),
             Self::Archive(path) => {
                 let mut digest = Sha256::new();
-                let cannot = || format!("cannot read {}", path.display());
-                io::copy(&mut File::open(path).with_context(cannot)?, &mut digest)
-                    .with_context(cannot)?;
+                io::copy(&mut archive(path)?, &mut digest)
+                    .with_context(|| format!("cannot read {}", path.display()))?;
                 Ok(hex(&digest.finalize()))
             }
         }
@@ -104,98 +104,31 @@ impl Submission {
     /// If the submission is invalid.
     pub(super) fn unpack(&self, to: &Path) -> Result<()> {
         let files = match self {
-            Self::Folder(folder) => read_folder(folder)?,
+            Self::Folder(folder) => Door::open(folder)?.files(&[])?,
             Self::Archive(path) => {
                 let cannot = || format!("{} is not a valid submission", path.display());
-                let size = fs::metadata(path).with_context(cannot)?.len();
+                let mut bytes = Vec::new();
+                archive(path)?.take(MOST_BYTES + 1).read_to_end(&mut bytes).with_context(cannot)?;
                 ensure!(
-                    size <= MOST_BYTES,
-                    "{}: {size} bytes are more than {MOST_BYTES}",
+                    bytes.len() as u64 <= MOST_BYTES,
+                    "{}: has more than {MOST_BYTES} bytes",
                     path.display()
                 );
-                without_outer_folder(
-                    open(&fs::read(path).with_context(cannot)?).with_context(cannot)?,
-                )
+                without_outer_folder(open(&bytes).with_context(cannot)?)
             }
         };
-        for (path, content) in &files {
-            write(&to.join(path), content)?;
-        }
-        // Student code runs as another user.
-        readable(to)
+        door::write(&files, to)
     }
 }
 
-/// Makes a folder readable for all users.
-fn readable(folder: &Path) -> Result<()> {
-    use std::os::unix::fs::PermissionsExt;
-    for entry in fs::read_dir(folder)? {
-        let path = entry?.path();
-        if path.is_dir() {
-            readable(&path)?;
-        } else {
-            let is_program = File::open(&path).is_ok_and(|mut file| {
-                let mut magic = [0; 4];
-                file.read_exact(&mut magic).is_ok()
-                    && (magic == *b"\x7fELF" || magic[..2] == *b"#!")
-            });
-            fs::set_permissions(
-                &path,
-                PermissionsExt::from_mode(if is_program { 0o755 } else { 0o644 }),
-            )?;
-        }
-    }
-    Ok(fs::set_permissions(folder, PermissionsExt::from_mode(0o755))?)
-}
-
-fn read_folder(root: &Path) -> Result<Files> {
-    let mut files = Files::new();
-    let mut left = vec![(root.to_owned(), String::new())];
-    let mut total = 0;
-    while let Some((folder, prefix)) = left.pop() {
-        let cannot = || format!("cannot read {}", folder.display());
-        for entry in fs::read_dir(&folder).with_context(cannot)? {
-            let entry = entry.with_context(cannot)?;
-            let name = entry.file_name();
-            let name = name.to_str().with_context(|| {
-                format!("{}: the name is not valid UTF-8", entry.path().display())
-            })?;
-            let (kind, path) = (entry.file_type().with_context(cannot)?, format!("{prefix}{name}"));
-            let is_made =
-                Path::new(name).extension().is_some_and(|end| end == "pyc" || end == "mcap");
-            if name.starts_with('.') || is_made {
-                continue;
-            }
-            if kind.is_dir() {
-                if !MADE.contains(&name) {
-                    left.push((entry.path(), format!("{path}/")));
-                }
-                continue;
-            }
-            ensure!(
-                kind.is_file(),
-                "{} is a link or not a regular file; submit the file itself",
-                entry.path().display()
-            );
-            total += entry.metadata().with_context(cannot)?.len();
-            ensure!(
-                total <= MOST_BYTES,
-                "{} contains more than {MOST_BYTES} bytes",
-                root.display()
-            );
-            ensure!(
-                files.len() < MOST_FILES,
-                "{} contains more than {MOST_FILES} files",
-                root.display()
-            );
-            files.insert(path, fs::read(entry.path()).with_context(cannot)?);
-        }
-    }
-    Ok(files)
+fn archive(path: &Path) -> Result<File> {
+    let name = path.file_name().unwrap_or_default();
+    Door::open(path.parent().unwrap_or(Path::new("")))?.file(Path::new(name))
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::archive::Files;
     use super::*;
 
     fn files(paths: &[&str]) -> Files {
@@ -217,12 +150,13 @@ mod tests {
         for path in all {
             write(&folder.path().join(path), path.as_bytes()).unwrap();
         }
-        let read = read_folder(folder.path()).unwrap();
+        let read = Door::open(folder.path()).unwrap().files(&[]).unwrap();
         assert_eq!(read, files(&["net/w.onnx", "plugin.py", "vizflyt.toml"]));
         let bytes = pack(&read).unwrap();
         assert_eq!(bytes, pack(&read).unwrap(), "contains no times");
         assert_eq!(open(&bytes).unwrap(), read);
         std::os::unix::fs::symlink("/etc/passwd", folder.path().join("x")).unwrap();
-        assert!(read_folder(folder.path()).unwrap_err().to_string().contains("is a link"));
+        let error = Door::open(folder.path()).unwrap().files(&[]).unwrap_err();
+        assert!(error.to_string().contains("is a link"), "{error}");
     }
 }
