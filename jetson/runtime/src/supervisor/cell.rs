@@ -56,6 +56,8 @@ pub(super) struct Cell {
 #[derive(Clone, Debug)]
 struct Shown {
     path: CString,
+    /// The same file or folder by a path without links.
+    source: CString,
     is_folder: bool,
     is_writable: bool,
     /// Covered parent folders, outermost first; they must be created before the mount.
@@ -78,6 +80,9 @@ pub(super) struct Places {
     pub writable: Vec<PathBuf>,
     /// Hidden paths, also inside shown folders.
     pub hidden: Vec<PathBuf>,
+    /// Folders that student code may change, each with its canonical path. A path in them is not shown if links lead
+    /// it out of them.
+    pub untrusted: Vec<(PathBuf, PathBuf)>,
     /// Folder in which the plugin starts.
     pub folder: PathBuf,
 }
@@ -107,15 +112,25 @@ impl Cell {
         let mut shown: Vec<Shown> = Vec::new();
         for (paths, is_writable) in [(&places.readable, false), (&places.writable, true)] {
             for path in paths {
+                let (Ok(path), Ok(source)) = (std::path::absolute(path), path.canonicalize())
+                else {
+                    continue;
+                };
+                if places.untrusted.iter().any(|(folder, canonical)| {
+                    let is_in = path.starts_with(folder) || path.starts_with(canonical);
+                    is_in && !source.starts_with(canonical)
+                }) {
+                    continue;
+                }
                 // By the given path, and by the canonical path.
-                let names = [std::path::absolute(path).ok(), path.canonicalize().ok()];
-                for path in names.into_iter().flatten().filter(|path| path.exists()) {
+                for path in [&path, &source] {
                     let under = covered.iter().find(|covered| path.starts_with(covered));
                     let is_there = under.is_none() && !is_writable;
-                    if is_there || under.is_some_and(|covered| *covered == path) {
+                    if is_there || under.is_some_and(|covered| covered == path) {
                         continue;
                     }
-                    shown.push(Shown::new(&path, under.map(PathBuf::as_path), is_writable)?);
+                    let under = under.map(PathBuf::as_path);
+                    shown.push(Shown::new(path, &source, under, is_writable)?);
                 }
             }
         }
@@ -132,7 +147,7 @@ impl Cell {
         shown.retain(|shown| {
             let path = shown.path();
             let is_within = paths.iter().any(|outer| path != *outer && path.starts_with(outer));
-            !is_within || path.canonicalize().is_ok_and(|canonical| canonical == path)
+            !is_within || shown.path == shown.source
         });
         let hidden = places.hidden.iter().filter_map(|path| path.canonicalize().ok());
         let hidden = hidden.filter(|path| {
@@ -156,7 +171,7 @@ impl Cell {
             hidden,
             folder: {
                 let under = covered.iter().find(|covered| places.folder.starts_with(covered));
-                Shown::new(&places.folder, under.map(PathBuf::as_path), false)?
+                Shown::new(&places.folder, &places.folder, under.map(PathBuf::as_path), false)?
             },
             uid_map: c_text(&format!("{uid} {uid} 1"))?,
             gid_map: c_text(&format!("{gid} {gid} 1"))?,
@@ -260,7 +275,7 @@ impl Cell {
         mount("private mounts", None, c"/", None, private, None)?;
         let mut trees = [-1; MAX_PLACES];
         for (tree, shown) in trees.iter_mut().zip(&self.shown) {
-            *tree = clone_tree(&shown.path)?;
+            *tree = shown.clone_source()?;
         }
         let read_only = libc::MOUNT_ATTR_RDONLY | libc::MOUNT_ATTR_NOSUID;
         set_attributes(libc::AT_FDCWD, c"/", libc::AT_RECURSIVE, read_only)?;
@@ -366,13 +381,19 @@ impl Cell {
 }
 
 impl Shown {
-    fn new(path: &Path, under: Option<&Path>, is_writable: bool) -> Result<Self, String> {
+    fn new(
+        path: &Path,
+        source: &Path,
+        under: Option<&Path>,
+        is_writable: bool,
+    ) -> Result<Self, String> {
         let missing = |folder: &&Path| under.is_some_and(|covered| folder.starts_with(covered));
         let mut way: Vec<&Path> = path.ancestors().skip(1).take_while(missing).collect();
         way.reverse();
         Ok(Self {
             path: c_path(path)?,
-            is_folder: path.is_dir(),
+            source: c_path(source)?,
+            is_folder: source.is_dir(),
             is_writable,
             way: way.into_iter().map(c_path).collect::<Result<_, _>>()?,
         })
@@ -380,6 +401,24 @@ impl Shown {
 
     fn path(&self) -> PathBuf {
         PathBuf::from(OsStr::from_bytes(self.path.as_bytes()))
+    }
+
+    /// Returns a detached copy of the mounts at the source. Fails if student code has put a link on its path since the
+    /// cell was prepared.
+    fn clone_source(&self) -> Result<RawFd, Fault> {
+        // SAFETY: a structure of numbers, for which zeros are valid.
+        let mut how: libc::open_how = unsafe { std::mem::zeroed() };
+        how.flags = (libc::O_PATH | libc::O_CLOEXEC | libc::O_NOFOLLOW) as u64;
+        how.resolve = libc::RESOLVE_NO_SYMLINKS;
+        let (path, size) = (self.source.as_ptr(), size_of::<libc::open_how>());
+        // SAFETY: a path and a structure that live through the call, with its size.
+        let file =
+            unsafe { libc::syscall(libc::SYS_openat2, libc::AT_FDCWD, path, &raw const how, size) };
+        step("a folder to show", file as i32)?;
+        let tree = clone_at(file as RawFd, c"");
+        // SAFETY: opened above, and not used any more.
+        unsafe { libc::close(file as RawFd) };
+        tree
     }
 
     /// Creates the parent folders and the mount point, if they are covered.
@@ -528,9 +567,15 @@ fn mount(
 
 /// Returns a detached copy of the mounts at `path`.
 fn clone_tree(path: &CStr) -> Result<RawFd, Fault> {
-    let flags = libc::OPEN_TREE_CLONE | libc::OPEN_TREE_CLOEXEC | libc::AT_RECURSIVE as u32;
+    clone_at(libc::AT_FDCWD, path)
+}
+
+/// Same as [`clone_tree`], relative to a folder; an empty path is the folder itself.
+fn clone_at(folder: RawFd, path: &CStr) -> Result<RawFd, Fault> {
+    let empty = libc::AT_EMPTY_PATH | libc::AT_RECURSIVE;
+    let flags = libc::OPEN_TREE_CLONE | libc::OPEN_TREE_CLOEXEC | empty as u32;
     // SAFETY: a path that lives through the call.
-    let tree = unsafe { libc::syscall(libc::SYS_open_tree, libc::AT_FDCWD, path.as_ptr(), flags) };
+    let tree = unsafe { libc::syscall(libc::SYS_open_tree, folder, path.as_ptr(), flags) };
     step("a folder to show", tree as i32)?;
     Ok(tree as RawFd)
 }

@@ -307,20 +307,29 @@ fn cell(limits: &PluginLimits, command: &[OsString], own: &[PathBuf]) -> Result<
         None
     };
     let mut readable = limits.read.clone();
-    for path in command.iter().map(PathBuf::from) {
-        if path.components().count() > 1 && path.exists() {
-            readable.extend(links(&path));
+    let untrusted = untrusted(limits, command);
+    let is_untrusted = |path: &Path| {
+        untrusted.iter().any(|(folder, full)| path.starts_with(folder) || path.starts_with(full))
+    };
+    for path in command.iter().filter_map(|path| std::path::absolute(path).ok()) {
+        if path.exists() {
+            readable.extend(if is_untrusted(&path) { vec![path] } else { links(&path) });
         }
     }
     if let Some(program) = command.first().map(Path::new) {
         let is_bare = program.components().count() == 1;
         // Files next to a program belong to it, for example models and libraries.
-        let beside = program.parent().and_then(|folder| folder.canonicalize().ok());
-        readable.extend(beside.filter(|folder| !is_bare && is_somebodys(folder)));
+        let beside = program.parent().and_then(|folder| std::path::absolute(folder).ok());
+        let is_shown = |folder: &PathBuf| folder.canonicalize().is_ok_and(|it| is_somebodys(&it));
+        readable.extend(beside.filter(|folder| !is_bare && is_shown(folder)));
         let program = is_bare.then(|| on_path(program)).flatten().unwrap_or(program.to_owned());
-        for program in links(&program) {
-            readable.extend(installation(&program));
-            readable.push(program);
+        let program = std::path::absolute(&program).unwrap_or(program);
+        if is_untrusted(&program) {
+            readable.extend(environment(&program));
+        } else {
+            let programs = links(&program);
+            readable.extend(programs.iter().flat_map(|program| installation(program)));
+            readable.extend(programs);
         }
     }
     for name in ["PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH"] {
@@ -337,8 +346,54 @@ fn cell(limits: &PluginLimits, command: &[OsString], own: &[PathBuf]) -> Result<
         if limits.graded { own.first().cloned() } else { std::env::current_dir().ok() }
     });
     let folder = folder.unwrap_or_else(|| PathBuf::from("/tmp"));
-    let places = Places { readable, writable, hidden: limits.hide.clone(), folder };
+    let places = Places { readable, writable, hidden: limits.hide.clone(), untrusted, folder };
     Cell::prepare(user, limits.network, &places, (limits.memory_mb / 4).max(16))
+}
+
+/// Returns the student's folders by their given and their canonical paths.
+fn untrusted(limits: &PluginLimits, command: &[OsString]) -> Vec<(PathBuf, PathBuf)> {
+    let folders = scripts(command).into_iter().chain(limits.untrusted.iter().cloned());
+    let both = |folder: PathBuf| {
+        Some((std::path::absolute(&folder).ok()?, folder.canonicalize().ok()?))
+    };
+    folders.filter_map(both).filter(|(_, folder)| is_somebodys(folder)).collect()
+}
+
+/// Returns the paths that a program in a student's folder needs: those next to its `bin`, and the Python of its virtual
+/// environment.
+fn environment(program: &Path) -> Vec<PathBuf> {
+    let mut shown = installation(program);
+    let python = program.canonicalize().unwrap_or_default();
+    if is_python(&python) {
+        shown.extend(links(program));
+    }
+    // The environment finds its libraries by this setting, which may contain links of an installer.
+    let config = program.ancestors().nth(2).map(|prefix| prefix.join("pyvenv.cfg"));
+    let config = config.filter(|path| path.symlink_metadata().is_ok_and(|it| it.is_file()));
+    let text = config.and_then(|path| fs::read_to_string(path).ok()).unwrap_or_default();
+    let home = text.lines().filter_map(|line| line.split_once('='));
+    let home = home.filter(|(key, _)| key.trim() == "home");
+    let home = home.map(|(_, home)| Path::new(home.trim()).join("python3"));
+    let pythons = [python].into_iter().chain(home.filter(|path| path.is_absolute()));
+    for python in pythons.filter(|path| is_python(path)) {
+        shown.extend(installation(&python));
+        shown.push(python);
+    }
+    shown
+}
+
+/// Whether a program is an installed Python: `bin/python3`, with libraries next to `bin`.
+pub fn is_python(program: &Path) -> bool {
+    let name = program.file_name().unwrap_or_default().to_string_lossy();
+    let bin = program.parent().filter(|folder| folder.ends_with("bin"));
+    let Some(prefix) = bin.and_then(Path::parent) else { return false };
+    let libraries = ["lib", "lib64"].map(|lib| fs::read_dir(prefix.join(lib)));
+    let mut libraries = libraries.into_iter().flatten().flatten().flatten();
+    let is_library = |entry: fs::DirEntry| {
+        entry.file_name().to_string_lossy().starts_with("python3")
+            && entry.path().join("os.py").is_file()
+    };
+    name.starts_with("python3") && program.is_file() && libraries.any(is_library)
 }
 
 /// Returns `path` and all targets of its chain of symbolic links, at most 16 paths.
@@ -437,16 +492,9 @@ fn on_path(program: &Path) -> Option<PathBuf> {
 /// Returns the folders of the student's own code: folders and the folders of scripts on the command
 /// line, and, if not graded, the working folder; never a complete home folder or the root folder.
 fn own_folders(limits: &PluginLimits, command: &[OsString]) -> Vec<PathBuf> {
-    let scripts = command.iter().map(Path::new).filter_map(|path| {
-        if path.is_dir() {
-            return Some(path.to_owned());
-        }
-        let is_script = path.extension().is_some_and(|extension| extension == "py");
-        path.parent().filter(|_| is_script && path.is_file()).map(Path::to_owned)
-    });
     let mut folders: Vec<PathBuf> = Vec::new();
     let working = std::env::current_dir().ok().filter(|_| !limits.graded);
-    for folder in scripts.chain(working) {
+    for folder in scripts(command).into_iter().chain(working) {
         let Ok(folder) = folder.canonicalize().or_else(|_| std::path::absolute(&folder)) else {
             continue;
         };
@@ -455,6 +503,18 @@ fn own_folders(limits: &PluginLimits, command: &[OsString]) -> Vec<PathBuf> {
         }
     }
     folders
+}
+
+/// Returns the folders, and the folders of scripts, on the command line.
+fn scripts(command: &[OsString]) -> Vec<PathBuf> {
+    let scripts = command.iter().map(Path::new).filter_map(|path| {
+        if path.is_dir() {
+            return Some(path.to_owned());
+        }
+        let is_script = path.extension().is_some_and(|extension| extension == "py");
+        path.parent().filter(|_| is_script && path.is_file()).map(Path::to_owned)
+    });
+    scripts.collect()
 }
 
 /// Whether a folder is neither the root folder nor one that contains the home folder.

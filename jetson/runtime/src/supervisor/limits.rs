@@ -43,6 +43,9 @@ pub struct PluginLimits {
     pub write: Vec<PathBuf>,
     /// Files and folders shown in a cell in addition to the plugin's own, the system and its interpreter.
     pub read: Vec<PathBuf>,
+    /// Folders of the student in addition to those of scripts on the command line. Links in them are not followed out
+    /// of them, except from a virtual environment to its Python.
+    pub untrusted: Vec<PathBuf>,
     /// Folder in which the plugin starts. Default: the working folder.
     pub folder: Option<PathBuf>,
     /// Whether the plugin is graded: the plugin's folder is read-only, the working folder is hidden, its scratch
@@ -71,6 +74,7 @@ impl Default for PluginLimits {
             user: None,
             write: Vec::new(),
             read: Vec::new(),
+            untrusted: Vec::new(),
             folder: None,
             graded: false,
             map: None,

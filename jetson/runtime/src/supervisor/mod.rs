@@ -34,7 +34,7 @@ use confine::Bounds;
 use occupation::{Look, Occupation};
 use output::{Tracebacks, read_lines};
 
-pub use confine::Confinement;
+pub use confine::{Confinement, is_python};
 pub use limits::{MIN_MEMORY_MB, PluginLimits, Restart};
 pub use occupation::TimeSpent;
 pub use output::LINE_BYTES;

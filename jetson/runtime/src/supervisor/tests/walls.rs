@@ -186,6 +186,53 @@ fn makes_a_cell_if_a_shown_folder_contains_links() {
     assert!(lines.iter().any(|(_, line)| line == "found"), "{lines:?} {sentence}");
 }
 
+/// A student's folder with links to a folder of the instructor.
+#[test]
+fn follows_no_link_out_of_a_students_folder() {
+    if !has_cells() {
+        return;
+    }
+    let open = || std::os::unix::fs::PermissionsExt::from_mode(0o755);
+    let outer = tempfile::tempdir_in("/var/tmp").unwrap();
+    fs::set_permissions(outer.path(), open()).unwrap();
+    let victim = outer.path().join("victim");
+    fs::create_dir_all(victim.join("bin")).unwrap();
+    fs::write(victim.join("secret"), "").unwrap();
+    std::os::unix::fs::symlink("/usr/bin/python3", victim.join("bin/python3")).unwrap();
+    let own = outer.path().join("own");
+    let script = own.join("plugin.py");
+    for (aim, link) in [
+        ("bin/python3", "/usr/bin/python3"),
+        ("bin/python3", victim.join("bin/python3").to_str().unwrap()),
+        ("lib", victim.to_str().unwrap()),
+        ("lib64", "../../victim"),
+        ("pyvenv.cfg", victim.join("secret").to_str().unwrap()),
+    ] {
+        let _ = fs::remove_dir_all(&own);
+        fs::create_dir_all(own.join(".venv/bin")).unwrap();
+        fs::write(&script, format!("import os; print(os.path.exists({:?}))", victim.join("secret")))
+            .unwrap();
+        let python = own.join(".venv/bin/python3");
+        std::os::unix::fs::symlink(link, own.join(".venv").join(aim)).unwrap();
+        let _ = std::os::unix::fs::symlink("/usr/bin/python3", &python);
+        let command = [python.to_str().unwrap(), script.to_str().unwrap()];
+        for limits in [PluginLimits::default(), graded()] {
+            let (lines, sentence) = to_the_end_with(&limits, &command);
+            assert!(!lines.iter().any(|(_, line)| line == "True"), "{aim}: {lines:?} {sentence}");
+            let is_started = lines.iter().any(|(_, line)| line == "False");
+            assert!(is_started, "{aim}: {lines:?} {sentence}");
+        }
+    }
+    // The student's code replaces its folder by a link after the cell was prepared.
+    let limits = PluginLimits { write: vec![own.clone()], ..graded() };
+    let confinement = Confinement::prepare(&limits, &[]);
+    fs::rename(&own, outer.path().join("old")).unwrap();
+    std::os::unix::fs::symlink(&victim, &own).unwrap();
+    let mut shell = confinement.command("sh");
+    shell.args(["-c", "ls", own.to_str().unwrap()]);
+    assert!(confinement.run(shell, WAIT).is_err());
+}
+
 #[test]
 fn counts_memory_of_all_descendants() {
     if !has_cells() {
