@@ -4,6 +4,8 @@ import json
 import os
 import pathlib
 import shutil
+import subprocess
+import sys
 import tempfile
 import zipfile
 
@@ -114,7 +116,7 @@ def links(folder, victim):
         plugin = folder / f"link-{name}"
         write(plugin, {"other.py": spy(victim)} | ({} if name == "plugin.py" else {"plugin.py": spy(victim)}))
         (plugin / name).symlink_to(victim.secret)
-        victim.check(f"grade, {name} is a link", grade(plugin, folder), "link")
+        victim.check(f"grade, {name} is a link", grade(plugin, folder), "is a link")
 
 
 def honest_environment(folder):
@@ -122,8 +124,8 @@ def honest_environment(folder):
     plugin = folder / "honest"
     write(plugin, {"plugin.py": "import vizflyt\n",
                    "vizflyt/__init__.py": "import sys, numbers_of_mine\nsys.exit(f'HONEST {sys.prefix}')\n"})
-    done = checks_python("-m", "venv", "--without-pip", plugin / ".venv")
-    if done.returncode:
+    make = [sys.executable, "-m", "venv", "--without-pip", str(plugin / ".venv")]
+    if subprocess.run(make, check=False).returncode:
         print("skipped: an honest environment, for want of venv")
         return
     packages = next((plugin / ".venv/lib").glob("python3*/site-packages"))
@@ -131,12 +133,6 @@ def honest_environment(folder):
     for how in (grade, fly):
         text = how(plugin, folder).stderr
         check(f"{how.__name__}: a student's own environment works", f"HONEST {plugin}/.venv" in text, text[-1500:])
-
-
-def checks_python(*arguments):
-    import subprocess
-    import sys
-    return subprocess.run([sys.executable, *map(str, arguments)], check=False, capture_output=True, text=True)
 
 
 WRAPPER = """#!/usr/bin/python3

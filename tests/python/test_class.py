@@ -78,7 +78,7 @@ def test_a_class_gets_its_grades_and_nobody_sees_the_others(desk, tmp_path):
             assert rows[team]["signed"] == "no", rows
             continue
         # Its own folder and the parent folder only; no other submission, grade or name.
-        assert f"plugins/{team}" in seen, seen
+        assert f"/{team}" in seen, seen
         for other in {"red", "blue", "up", "gone"} - {team}:
             assert f"/{other}" not in seen, seen
         assert "grade.json" not in seen and "roster" not in seen and ".zip" not in seen, seen

@@ -66,6 +66,9 @@ pub(super) struct FlyArgs {
     /// Path to hide from the plugin, like keys, seed and report; can be repeated
     #[arg(long, help_heading = "Plugin", value_name = "PATH")]
     pub(super) hide: Vec<PathBuf>,
+    /// Folder for the output of Cargo: `--watch` keeps it between its attempts
+    #[arg(long, value_name = "DIR", hide = true)]
+    pub(super) build_in: Option<PathBuf>,
     /// Grade again when the plugin is saved, and print what changed
     #[arg(long, help_heading = "Plugin", conflicts_with_all = ["resume", "shard", "json", "junit", "least"])]
     pub(super) watch: bool,

@@ -46,9 +46,11 @@ pub(crate) fn path_of(name: &str) -> Result<Option<String>> {
     });
     let parts: Option<Vec<&str>> = parts.collect();
     let parts = parts.filter(|parts| !parts.is_empty() && !name.contains(['\\', '\0']));
-    let parts = parts.with_context(|| format!("'{}' leads out of the archive", name.escape_debug()))?;
+    let parts =
+        parts.with_context(|| format!("'{}' leads out of the archive", name.escape_debug()))?;
     let folders = &parts[..parts.len() - 1];
-    let is_out = parts.iter().any(|part| is_left_out(part)) || folders.iter().any(|part| MADE.contains(part));
+    let is_out = parts.iter().any(|part| is_left_out(part))
+        || folders.iter().any(|part| MADE.contains(part));
     Ok((!is_out).then(|| parts.join("/")))
 }
 
@@ -85,7 +87,11 @@ impl Door {
                 if is_left_out(&name) || kind == FileType::Directory && MADE.contains(&&*name) {
                     continue;
                 }
-                ensure!(path.len() <= MOST_PATH, "{}: the path is too long; shorten it", at.display());
+                ensure!(
+                    path.len() <= MOST_PATH,
+                    "{}: the path is too long; shorten it",
+                    at.display()
+                );
                 if kind == FileType::Directory {
                     let found = fstat(self.folder(Path::new(&path))?)?;
                     if !except.contains(&(found.st_dev, found.st_ino)) {
@@ -93,17 +99,22 @@ impl Door {
                     }
                 } else {
                     let file = self.file(Path::new(&path))?;
-                    let found = file.metadata().with_context(|| format!("cannot read {}", at.display()))?;
+                    let found =
+                        file.metadata().with_context(|| format!("cannot read {}", at.display()))?;
                     if except.contains(&(found.dev(), found.ino())) {
                         continue;
                     }
-                    let content = read(file, left).with_context(|| format!("cannot read {}", at.display()))?;
+                    let content = read(file, left)
+                        .with_context(|| format!("cannot read {}", at.display()))?;
                     let rest = left.checked_sub(content.len() as u64);
                     left = rest.with_context(|| self.too_many(&format!("{MOST_BYTES} bytes")))?;
                     files.insert(path, content);
                 }
                 let count = files.len().max(folders.len() + opened);
-                ensure!(count <= MOST_FILES, self.too_many(&format!("{MOST_FILES} files or folders")));
+                ensure!(
+                    count <= MOST_FILES,
+                    self.too_many(&format!("{MOST_FILES} files or folders"))
+                );
             }
         }
         Ok(files)
@@ -121,7 +132,8 @@ impl Door {
         // Opening a device or a pipe can have effects or block, so the type is checked before and after.
         let found = statat(&folder, name, AtFlags::SYMLINK_NOFOLLOW).with_context(cannot)?;
         ensure!(FileType::from_raw_mode(found.st_mode) == FileType::RegularFile, is_link(&at));
-        let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
+        let flags =
+            OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
         let file = openat(&folder, name, flags, Mode::empty());
         let file = File::from(file.map_err(|error| refused(error, &at))?);
         ensure!(file.metadata().with_context(cannot)?.is_file(), is_link(&at));
@@ -155,7 +167,8 @@ impl Door {
                     Err(error) => bail!("cannot make {}: {error}", at.display()),
                 }
             }
-            folder = openat(&folder, part, FOLDER, Mode::empty()).map_err(|error| refused(error, &at))?;
+            folder = openat(&folder, part, FOLDER, Mode::empty())
+                .map_err(|error| refused(error, &at))?;
         }
         Ok(folder)
     }
@@ -170,7 +183,11 @@ impl Door {
             let entry = entry.with_context(cannot)?;
             let name = entry.file_name();
             let text = name.to_str().ok().with_context(|| {
-                format!("{}: the name {} is not valid UTF-8; rename it", at.display(), name.to_string_lossy())
+                format!(
+                    "{}: the name {} is not valid UTF-8; rename it",
+                    at.display(),
+                    name.to_string_lossy()
+                )
             })?;
             if [".", ".."].contains(&text) {
                 continue;
@@ -178,7 +195,8 @@ impl Door {
             // Some file systems list no types.
             let kind = match entry.file_type() {
                 FileType::Unknown => {
-                    let found = statat(&folder, name, AtFlags::SYMLINK_NOFOLLOW).with_context(cannot)?;
+                    let found =
+                        statat(&folder, name, AtFlags::SYMLINK_NOFOLLOW).with_context(cannot)?;
                     FileType::from_raw_mode(found.st_mode)
                 }
                 kind => kind,
@@ -193,7 +211,10 @@ impl Door {
     }
 
     fn too_many(&self, limit: &str) -> String {
-        format!("{} contains more than {limit}; give the plugin a folder of its own", self.path.display())
+        format!(
+            "{} contains more than {limit}; give the plugin a folder of its own",
+            self.path.display()
+        )
     }
 }
 
@@ -230,6 +251,16 @@ pub(crate) fn read_program(folder: &Path, path: &Path) -> Result<Vec<u8>> {
         path.display()
     );
     Ok(content)
+}
+
+/// Makes a folder that other users of the computer cannot enter; removed when dropped.
+///
+/// # Errors
+/// If it cannot be made.
+pub(crate) fn private_folder() -> Result<tempfile::TempDir> {
+    let mode = std::os::unix::fs::PermissionsExt::from_mode(0o700);
+    let folder = tempfile::Builder::new().prefix("vizflyt-").permissions(mode).tempdir();
+    folder.with_context(|| format!("cannot make a folder in {}", std::env::temp_dir().display()))
 }
 
 /// Writes files into a new folder. All users can read them, because student code may run as another user; the folder
@@ -329,7 +360,12 @@ mod tests {
         let (outer, root) = scene();
         let door = Door::open(&root).unwrap();
         let absolute = outer.path().join("secret/w.onnx");
-        for path in [Path::new("../secret/w.onnx"), Path::new("net/../plugin.py"), &absolute, Path::new("..")] {
+        for path in [
+            Path::new("../secret/w.onnx"),
+            Path::new("net/../plugin.py"),
+            &absolute,
+            Path::new(".."),
+        ] {
             assert!(door.file(path).is_err(), "{}", path.display());
             assert!(door.make(path).is_err(), "{}", path.display());
         }

@@ -4,7 +4,7 @@ use std::cell::Cell;
 use std::collections::HashMap;
 use std::hash::{BuildHasher, RandomState};
 use std::num::NonZero;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::available_parallelism;
@@ -30,6 +30,7 @@ use super::record::FlownWith;
 use super::trial::{AnotherWay, Delays, Trial, TrialLog, TrialResult};
 use super::{changes, figures, folder, junit, keys, pool, report};
 use crate::plugin::Plugin;
+use crate::plugin::submission::Submission;
 
 /// Runs `vizflyt grade`: flies, judges, reports.
 pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
@@ -38,7 +39,19 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let project = CourseProject::find(&args.project)?;
     let (delays, imu) = (delays(args)?, args.imu);
     let variants = variants(args, &project)?;
-    let subject = subject(args, &plugin, &project, &variants)?;
+    // Paths and memory that a plugin of the same user could read or forge: keys, and this process
+    // (proc(5)).
+    let keys = vizflyt_trust::KeysFolder::open(args.result.keys.as_deref())?;
+    nix::sys::prctl::set_dumpable(false).context("cannot protect the memory of this process")?;
+    let mut hide = vec![keys.file("")];
+    hide.extend(args.first_seed.file.clone());
+    // The report may be in the plugin's own folder, and contains logs of finished flights.
+    hide.extend(args.report.clone());
+    hide.extend(args.hide.clone());
+    let outputs = [&args.junit, &args.result.output].into_iter().flatten().cloned();
+    let except: Vec<PathBuf> = hide.iter().cloned().chain(outputs).collect();
+    let submission = Submission::read(&plugin, &except)?;
+    let subject = subject(args, &submission, &plugin, &project, &variants)?;
     let earlier = changes::earlier(args)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| args.since.is_some()) {
         changes::check(&earlier.subject, &subject)?;
@@ -55,17 +68,8 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let answer_within = Duration::try_from_secs_f64(args.answer_within)
         .with_context(|| format!("--answer-within {}: not a valid duration", args.answer_within))?;
     let stop: &AtomicBool = &*stop_flag(false)?;
-    // Paths and memory that a plugin of the same user could read or forge: keys, and this process
-    // (proc(5)).
-    let keys = vizflyt_trust::KeysFolder::open(args.result.keys.as_deref())?;
-    nix::sys::prctl::set_dumpable(false).context("cannot protect the memory of this process")?;
-    let mut hide = vec![keys.file("")];
-    hide.extend(args.first_seed.file.clone());
-    // The report may be in the plugin's own folder, and contains logs of finished flights.
-    hide.extend(args.report.clone());
-    hide.extend(args.hide.clone());
     let limits = PluginLimits { hide, graded: true, ..PluginLimits::default() };
-    let command = plugin.command(&limits)?;
+    let plugin = submission.check(&limits, args.build_in.as_deref())?;
     let flown_with = FlownWith::new(&subject, args.answer_within, args.log.name());
     let report = LiveReport::open(args, flown_with, &flights)?;
     let fly = |&(variant, seed): &(Variant, u64)| -> Result<Option<FlightDone>> {
@@ -75,8 +79,7 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
         let named = || format!("seed {seed}, {variant}");
         let course =
             CourseInstance::make(&project, args.level, variant, seed).with_context(named)?;
-        let limits = PluginLimits { map: course.map.clone(), ..limits.clone() };
-        let (course, command, limits) = (&course, &command[..], &limits);
+        let course = &course;
         let reached = Cell::new(None);
         let attempt = || -> Result<Option<FlightDone>> {
             let images = report.as_ref().and_then(|report| Some((report, args.log.images()?)));
@@ -87,7 +90,9 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
                 depth: args.log_depth,
                 plugin: typed,
             });
-            let reached = &reached;
+            let copy = plugin.copy()?;
+            let limits = PluginLimits { map: course.map.clone(), ..copy.limits.clone() };
+            let (command, limits, reached) = (&copy.command[..], &limits, &reached);
             let trial = Trial {
                 course,
                 seed,
@@ -140,7 +145,8 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let mut grade = Grade::new(subject, args.shard, runs);
     // All plugins have ended.
     let key = keys::signing_key(args.result.keys.as_deref())?;
-    let unsealed = Confinement::prepare(&limits, &command).unsealed();
+    let copy = plugin.copy()?;
+    let unsealed = Confinement::prepare(&copy.limits, &copy.command).unsealed();
     if let Some(why) = &unsealed {
         print_error(format_args!(
             "this grade is NOT signed: a plugin here could have accessed protected data ({why})"
@@ -243,17 +249,16 @@ fn variants(args: &FlyArgs, project: &CourseProject) -> Result<Vec<Variant>> {
 
 fn subject(
     args: &FlyArgs,
+    submission: &Submission<'_>,
     plugin: &Plugin,
     project: &CourseProject,
     variants: &[Variant],
 ) -> Result<Subject> {
     let drawn = variants.iter().filter(|variant| variant.is_drawn());
     let tenth = |ms: f64| (ms * 10.0).round() / 10.0;
-    let outputs = [&args.report, &args.junit, &args.result.output];
-    let outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
     Ok(Subject {
         plugin: plugin.name().to_string_lossy().into_owned(),
-        plugin_sha256: keys::plugin_sha256(&plugin.watched(), &outputs)?,
+        plugin_sha256: submission.sha256()?,
         project: graded_name(project),
         level: args.level.to_string(),
         variants: variants.iter().map(Variant::to_string).collect(),

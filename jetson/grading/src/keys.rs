@@ -9,13 +9,10 @@ use ed25519_dalek::{SigningKey, VerifyingKey};
 use sha2::{Digest, Sha256};
 use vizflyt_trust::{KeysFolder, from_hex, hex};
 
+use crate::door::Files;
+
 /// File in the folder of keys with the secret key, as 64 hexadecimal digits.
 const KEY_FILE: &str = "grading.key";
-/// Folders that are not part of a plugin: output of builds and interpreters.
-const LEFT_ASIDE: [&str; 4] = ["target", "__pycache__", "node_modules", "venv"];
-/// Maximum number of files in a plugin; a folder with more is not a plugin's.
-const MAX_FILES: usize = 20_000;
-
 /// Returns the key that signs grades; the first grade makes it.
 pub(crate) fn signing_key(keys: Option<&Path>) -> Result<SigningKey> {
     let folder = KeysFolder::open(keys)?;
@@ -70,30 +67,35 @@ pub(crate) fn program_sha256() -> Result<String> {
     Ok(hex(&hash.finalize()))
 }
 
-/// Returns the SHA-256 over a plugin's files: names and contents, sorted by name. `outputs`, the
-/// files that a grade writes, are excluded.
-pub(crate) fn plugin_sha256(path: &Path, outputs: &[&Path]) -> Result<String> {
-    let mut files = Vec::new();
-    if path.is_dir() {
-        let outputs: Vec<PathBuf> =
-            outputs.iter().filter_map(|output| output.canonicalize().ok()).collect();
-        gather(path, &outputs, &mut files)?;
-        files.sort();
-    } else {
-        files.push(found(path));
-    }
+/// Returns the SHA-256 over a plugin's files: names and contents, sorted by path.
+pub(crate) fn files_sha256(files: &Files) -> String {
+    let mut sorted: Vec<(&Path, &[u8])> =
+        files.iter().map(|(path, content)| (Path::new(path), &content[..])).collect();
+    sorted.sort();
     let mut hash = Sha256::new();
-    for file in &files {
-        let name = file.strip_prefix(path).ok().filter(|name| !name.as_os_str().is_empty());
-        let name = name.unwrap_or(file.file_name().map_or(path, Path::new)).to_string_lossy();
-        let len = fs::metadata(file).with_context(|| format!("{}", file.display()))?.len();
-        // Lengths come first, so that different folders give different bytes.
-        hash.update((name.len() as u64).to_le_bytes());
-        hash.update(name.as_bytes());
-        hash.update(len.to_le_bytes());
-        update(&mut hash, file)?;
+    for (path, content) in sorted {
+        start(&mut hash, path, content.len() as u64);
+        hash.update(content);
     }
+    hex(&hash.finalize())
+}
+
+/// Returns the SHA-256 of a program that is not a student's, as if it were a plugin's only file.
+pub(crate) fn program_file_sha256(path: &Path) -> Result<String> {
+    let file = found(path);
+    let len = fs::metadata(&file).with_context(|| format!("{}", file.display()))?.len();
+    let mut hash = Sha256::new();
+    start(&mut hash, file.file_name().map_or(path, Path::new), len);
+    update(&mut hash, &file)?;
     Ok(hex(&hash.finalize()))
+}
+
+/// Adds a file's name and length; both come before the content, so that different folders give different bytes.
+fn start(hash: &mut Sha256, name: &Path, len: u64) {
+    let name = name.to_string_lossy();
+    hash.update((name.len() as u64).to_le_bytes());
+    hash.update(name.as_bytes());
+    hash.update(len.to_le_bytes());
 }
 
 /// Returns the path of a program in PATH.
@@ -106,34 +108,6 @@ fn found(name: &Path) -> PathBuf {
     places.find(|place| place.is_file()).unwrap_or_else(|| name.to_owned())
 }
 
-fn gather(folder: &Path, outputs: &[PathBuf], files: &mut Vec<PathBuf>) -> Result<()> {
-    let entries = fs::read_dir(folder).with_context(|| format!("{}", folder.display()))?;
-    for entry in entries {
-        let entry = entry.with_context(|| format!("{}", folder.display()))?;
-        let (name, kind) = (entry.file_name(), entry.file_type()?);
-        let name = name.to_string_lossy();
-        if name.starts_with('.') || LEFT_ASIDE.contains(&name.as_ref()) {
-            continue;
-        }
-        if !outputs.is_empty()
-            && entry.path().canonicalize().is_ok_and(|path| outputs.contains(&path))
-        {
-            continue;
-        }
-        // A link to a file counts as the file. Links to folders are ignored: they may lead outside
-        // or in circles.
-        if kind.is_dir() {
-            gather(&entry.path(), outputs, files)?;
-        } else if entry.path().is_file() {
-            files.push(entry.path());
-        }
-        if files.len() > MAX_FILES {
-            bail!("{} contains more than {MAX_FILES} files; is it a plugin's?", folder.display());
-        }
-    }
-    Ok(())
-}
-
 fn update(hash: &mut Sha256, path: &Path) -> Result<()> {
     let mut file = File::open(path).with_context(|| format!("cannot read {}", path.display()))?;
     std::io::copy(&mut file, hash).with_context(|| format!("cannot read {}", path.display()))?;
@@ -143,6 +117,7 @@ fn update(hash: &mut Sha256, path: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::door::Door;
 
     #[test]
     fn makes_a_secret_key_once() {
@@ -174,7 +149,8 @@ mod tests {
         write("plugin.py", "import vizflyt");
         write("lib/steer.py", "x = 1");
         let out = folder.path().join("out");
-        let hash = || plugin_sha256(folder.path(), &[&out]).unwrap();
+        let read = || Door::open(folder.path()).unwrap().files(std::slice::from_ref(&out)).unwrap();
+        let hash = || files_sha256(&read());
         let first = hash();
         write("__pycache__/plugin.pyc", "1");
         write(".venv/lib/numpy.py", "2");
@@ -187,7 +163,10 @@ mod tests {
         // The same bytes under another name are another plugin.
         fs::rename(folder.path().join("lib"), folder.path().join("lib2")).unwrap();
         assert_ne!(hash(), second);
-        assert_ne!(plugin_sha256(&folder.path().join("plugin.py"), &[]).unwrap(), first);
-        assert!(plugin_sha256(&folder.path().join("gone.py"), &[]).is_err());
+        let script = folder.path().join("plugin.py");
+        assert_ne!(program_file_sha256(&script).unwrap(), first);
+        let only = Files::from([("plugin.py".to_owned(), fs::read(&script).unwrap())]);
+        assert_eq!(program_file_sha256(&script).unwrap(), files_sha256(&only));
+        assert!(program_file_sha256(&folder.path().join("gone.py")).is_err());
     }
 }

@@ -17,6 +17,7 @@ use super::args::FlyArgs;
 use super::document::Grade;
 use super::folder::{self, ReportFolder};
 use super::{changes, figures};
+use crate::door;
 use crate::plugin::Plugin;
 use crate::plugin::watch::{LOOK_EVERY, Sources};
 
@@ -27,10 +28,12 @@ pub(super) fn watch(args: &FlyArgs) -> Result<ExitCode> {
     let stop: &AtomicBool = &*stop_flag(false)?;
     let mut earlier = changes::earlier(args)?;
     let mut attempt = 0;
+    // Dependencies are built once.
+    let build = door::private_folder()?;
     while !stop.load(Ordering::Relaxed) {
         let saved = Sources::of(&plugin.watched());
         let is_saved = || Sources::of(&plugin.watched()) != saved;
-        match fly(args, stop, &is_saved)? {
+        match fly(args, build.path(), stop, &is_saved)? {
             None => {
                 if !stop.load(Ordering::Relaxed) {
                     print_error("saved meanwhile: started again");
@@ -68,7 +71,12 @@ enum Attempt {
 }
 
 /// Flies all flights once; returns `None` if interrupted, or if the plugin is saved.
-fn fly(args: &FlyArgs, stop: &AtomicBool, is_saved: &dyn Fn() -> bool) -> Result<Option<Attempt>> {
+fn fly(
+    args: &FlyArgs,
+    build: &Path,
+    stop: &AtomicBool,
+    is_saved: &dyn Fn() -> bool,
+) -> Result<Option<Attempt>> {
     // On the same disk as the report, so that it can be moved atomically.
     let beside = args.report.as_deref().map(Path::parent).unwrap_or_default();
     let beside = beside.filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -81,6 +89,7 @@ fn fly(args: &FlyArgs, stop: &AtomicBool, is_saved: &dyn Fn() -> bool) -> Result
     let mut command = Command::new(std::env::current_exe()?);
     command.args(std::env::args_os().skip(1).filter(|arg| arg != "--watch"));
     // Options given twice: the last one counts (`args_override_self`).
+    command.arg("--build-in").arg(build);
     command.arg("--output").arg(&document).stdout(Stdio::null()).stdin(Stdio::null());
     if let Some(folder) = &args.report {
         command.arg("--report").arg(&report).arg("--hide").arg(folder);

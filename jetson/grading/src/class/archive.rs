@@ -43,11 +43,7 @@ pub fn open(bytes: &[u8]) -> Result<Files> {
         left = left
             .checked_sub(content.len() as u64)
             .with_context(|| format!("the archive contains more than {MOST_BYTES} bytes"))?;
-        ensure!(
-            files.insert(path, content).is_none(),
-            "'{}' occurs twice",
-            name.escape_debug()
-        );
+        ensure!(files.insert(path, content).is_none(), "'{}' occurs twice", name.escape_debug());
     }
     for path in files.keys() {
         let is_folder = path.match_indices('/').any(|(at, _)| files.contains_key(&path[..at]));
@@ -115,8 +111,13 @@ mod tests {
     #[test]
     fn leaves_out_settings_of_tools_and_build_output() {
         let all = files(&[
-            "plugin.py", ".cargo/config.toml", "a/.cargo/config.toml", ".venv/bin/python3", "target/x",
-            "__pycache__/p.py", "a.pyc",
+            "plugin.py",
+            ".cargo/config.toml",
+            "a/.cargo/config.toml",
+            ".venv/bin/python3",
+            "target/x",
+            "__pycache__/p.py",
+            "a.pyc",
         ]);
         let found = open(&pack(&all).unwrap()).unwrap();
         assert_eq!(found, files(&["plugin.py"]));

@@ -2,22 +2,23 @@
 //!
 //! ```text
 //! cargo metadata   run in the root folder, so that the project's settings do not apply; fetches dependencies
-//! cargo build      in the sandbox, without network
+//! cargo build      in the sandbox, without network; for a grade also in the root folder
 //! ```
 
 use std::ffi::OsString;
-use std::os::unix::fs::chown;
+use std::os::unix::fs::fchown;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 use std::{env, fs};
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use serde::Deserialize;
 use serde_json::Value;
 use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
 
 use super::sources;
+use crate::door::Door;
 
 /// Description of a project by Cargo.
 #[derive(Deserialize)]
@@ -41,26 +42,46 @@ const BUILD_WITHIN: Duration = Duration::from_mins(30);
 /// each.
 const BUILD_PROCESSES: u32 = 4096;
 
-/// Builds a Cargo project and returns its program. Cargo's messages go to standard error.
+/// Copy of a graded project.
+pub(super) struct ProjectCopy<'a> {
+    /// Folder of the submission, which must contain the project's workspace.
+    pub root: &'a Path,
+    /// Folder of the grader for the build's output.
+    pub target: &'a Path,
+}
+
+/// Builds a Cargo project and returns its program. Cargo's messages go to standard error. Without a `copy`, the output
+/// goes into the project's own folder.
 ///
 /// # Errors
 /// If the build fails, or if the project has no or several programs. For a grade, also if packages
 /// come from another folder on this computer.
-pub(super) fn build(folder: &Path, limits: &PluginLimits) -> Result<PathBuf> {
+pub(super) fn build(
+    folder: &Path,
+    copy: Option<&ProjectCopy<'_>>,
+    limits: &PluginLimits,
+) -> Result<PathBuf> {
+    let folder = if folder == Path::new("") { Path::new(".") } else { folder };
     let folder = folder.canonicalize().with_context(|| format!("{}", folder.display()))?;
     let metadata = metadata(&folder)?;
     let own = &metadata.workspace_root;
     let mut read = metadata.elsewhere(limits.graded)?;
     read.push(own.clone());
     read.extend(toolchain());
-    let target = metadata.target_directory.clone();
-    fs::create_dir_all(&target).with_context(|| format!("cannot make {}", target.display()))?;
+    ensure!(
+        copy.is_none_or(|copy| own.starts_with(copy.root)),
+        "its workspace is {}, outside its folder: a graded plugin must contain its workspace",
+        own.display()
+    );
+    let target = copy.map_or_else(|| metadata.own_target(), |copy| Ok(copy.target.to_owned()))?;
     let limits = PluginLimits {
         processes: BUILD_PROCESSES,
         network: false,
         read,
         write: vec![target.clone()],
-        folder: Some(folder.clone()),
+        untrusted: vec![own.clone()],
+        // Cargo takes settings and toolchain from the folder in which it starts, and from those around it.
+        folder: Some(if limits.graded { "/".into() } else { folder.clone() }),
         graded: limits.graded,
         hide: limits.hide.clone(),
         user: limits.user.clone(),
@@ -70,16 +91,17 @@ pub(super) fn build(folder: &Path, limits: &PluginLimits) -> Result<PathBuf> {
     let target = match confinement.user_id() {
         // Root made the folder, but another user builds.
         Some(user) => {
-            let target = target.join("confined");
-            fs::create_dir_all(&target)?;
-            chown(&target, Some(user), None).context("cannot hand the build its folder")?;
-            target
+            let own = Door::open(&target)?.make(Path::new("confined"))?;
+            fchown(own, Some(user), None).context("cannot hand the build its folder")?;
+            target.join("confined")
         }
         None => target,
     };
     let mut cargo = confinement.command("cargo");
     cargo
         .args(["build", "--release", "--offline", "--message-format=json-render-diagnostics"])
+        .arg("--manifest-path")
+        .arg(folder.join("Cargo.toml"))
         .arg("--target-dir")
         .arg(&target)
         // The wrapper needs a server process, which is not in the sandbox.
@@ -97,9 +119,16 @@ pub(super) fn build(folder: &Path, limits: &PluginLimits) -> Result<PathBuf> {
     let programs = programs(&String::from_utf8_lossy(&output.stdout));
     match programs.as_slice() {
         // The output of the build is untrusted student code.
-        [program] if program.starts_with(&target) => Ok(program.clone()),
         [program] => {
-            bail!("{} builds {}, outside its target folder", folder.display(), program.display())
+            let inner = program.strip_prefix(&target).map_err(|_| {
+                anyhow!(
+                    "{} builds {}, outside its target folder",
+                    folder.display(),
+                    program.display()
+                )
+            })?;
+            Door::open(&target)?.file(inner)?;
+            Ok(program.clone())
         }
         [] => bail!("{} builds no program; a plugin has a src/main.rs", folder.display()),
         several => bail!(
@@ -117,6 +146,8 @@ fn metadata(folder: &Path) -> Result<Metadata> {
     let mut cargo = Command::new("cargo");
     cargo.args(["metadata", "--format-version=1", "--quiet", "--manifest-path"]);
     cargo.arg(folder.join("Cargo.toml")).current_dir("/").stdin(Stdio::null());
+    // Cargo would write a cache into the project's `target`, which may be a link.
+    cargo.env("CARGO_CACHE_RUSTC_INFO", "0");
     let output = cargo.stderr(Stdio::inherit()).output().with_context(|| {
         format!("cannot start cargo to build {}; rustup.rs installs it", folder.display())
     })?;
@@ -129,6 +160,27 @@ fn metadata(folder: &Path) -> Result<Metadata> {
 }
 
 impl Metadata {
+    /// Makes the project's folder for output.
+    ///
+    /// # Errors
+    /// If it is a link: the build could write where the link leads. A folder outside the project is the user's choice.
+    fn own_target(&self) -> Result<PathBuf> {
+        let target = &self.target_directory;
+        match target.strip_prefix(&self.workspace_root) {
+            Ok(inner) => {
+                drop(Door::open(&self.workspace_root)?.make(inner).with_context(|| {
+                    format!(
+                        "cannot build in {}; remove it, or name another folder in CARGO_TARGET_DIR",
+                        target.display()
+                    )
+                })?)
+            }
+            Err(_) => fs::create_dir_all(target)
+                .with_context(|| format!("cannot make {}", target.display()))?,
+        }
+        Ok(target.clone())
+    }
+
     /// Returns the folders of packages outside the project.
     ///
     /// # Errors

@@ -6,6 +6,8 @@ use anyhow::{Context, Result, bail};
 use serde::Deserialize;
 use vizflyt_scenes::projects::{CourseProject, Level};
 
+use crate::door::Door;
+
 /// Content of `vizflyt.toml`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -69,10 +71,10 @@ impl PluginManifest {
     /// If the file cannot be read, or has invalid settings.
     pub fn read(folder: &Path) -> Result<Option<Self>> {
         let file = folder.join(FILE);
-        if !file.is_file() {
+        if file.symlink_metadata().is_err() {
             return Ok(None);
         }
-        let text = std::fs::read_to_string(&file)
+        let text = std::io::read_to_string(Door::open(folder)?.file(Path::new(FILE))?)
             .with_context(|| format!("cannot read {}", file.display()))?;
         let mut manifest = Self::parse(&text).with_context(|| format!("{}", file.display()))?;
         manifest.plugin = beneath(folder, &manifest.plugin)

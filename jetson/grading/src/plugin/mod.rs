@@ -10,6 +10,7 @@
 pub mod built_in;
 mod cargo;
 pub mod manifest;
+pub(crate) mod submission;
 pub mod watch;
 
 use std::ffi::{OsStr, OsString};
@@ -19,10 +20,11 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
-use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
+use vizflyt_runtime::supervisor::{Confinement, PluginLimits, is_python};
 
 use self::built_in::BuiltIn;
 use self::manifest::{LabConfig, PluginManifest};
+use crate::door::Door;
 
 /// A plugin that exists.
 #[derive(Clone, Debug, PartialEq)]
@@ -119,16 +121,16 @@ impl Plugin {
                 let program = std::env::current_exe().context("cannot find this program's path")?;
                 Ok(vec![program.into(), "plugin".into(), self.name.clone()])
             }
-            // A graded plugin starts in another folder, so a relative path must be made absolute; a
-            // name in PATH stays.
+            // A plugin may start in another folder, so a relative path must be made absolute; a name
+            // in PATH stays.
             PluginKind::Program(path) => {
                 Ok(vec![if path.is_file() { absolute(path)?.into() } else { path.into() }])
             }
-            PluginKind::Cargo(folder) => Ok(vec![cargo::build(folder, limits)?.into()]),
+            PluginKind::Cargo(folder) => Ok(vec![cargo::build(folder, None, limits)?.into()]),
             PluginKind::Script(script) => {
                 let path = absolute(script)?;
-                let python = python_of(&path);
-                check_python(&python, script, limits)?;
+                let python = python_of(&path)?;
+                check_python(&python, script, &path, limits)?;
                 // Unbuffered, so that printed lines appear immediately, not after 8 kB.
                 Ok(vec![python.into(), "-u".into(), path.into()])
             }
@@ -166,9 +168,32 @@ fn on_path(name: &OsStr) -> bool {
 
 /// Returns the interpreter of the script's virtual environment, or of the environment that this
 /// program was installed into, or the one in PATH.
-fn python_of(script: &Path) -> PathBuf {
-    let own = script.parent().unwrap_or(Path::new("")).join(".venv/bin/python3");
-    if own.exists() { own } else { own_python().unwrap_or_else(|| "python3".into()) }
+///
+/// # Errors
+/// If the environment is a link, or its interpreter leads to anything except a Python.
+fn python_of(script: &Path) -> Result<PathBuf> {
+    let folder = script.parent().unwrap_or(Path::new(""));
+    let own = folder.join(".venv/bin/python3");
+    if folder.join(".venv").symlink_metadata().is_err() || !own.exists() {
+        return Ok(own_python().unwrap_or_else(|| "python3".into()));
+    }
+    let advice = || {
+        let venv = folder.join(".venv");
+        format!("remove {0} and make it with `python3 -m venv {0}`", venv.display())
+    };
+    let bin = Door::open(folder)?.folder(Path::new(".venv/bin")).with_context(advice)?;
+    drop(bin);
+    let python = own.canonicalize().with_context(|| format!("cannot read {}", own.display()))?;
+    let is_link = own.is_symlink() && !python.starts_with(folder.canonicalize()?);
+    if is_link && !is_python(&python) {
+        bail!(
+            "{} leads to {}, which is not a Python; {}",
+            own.display(),
+            python.display(),
+            advice()
+        );
+    }
+    Ok(own)
 }
 
 /// Returns the interpreter next to this program, if `pip install` has installed the program.
@@ -199,8 +224,8 @@ vizflyt.run
 const CHECK_WITHIN: Duration = Duration::from_mins(2);
 
 /// Checks that the plugin is valid Python and finds the package, before other processes are
-/// started.
-fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<()> {
+/// started. `copy` is the checked file; messages name `script`.
+fn check_python(python: &Path, script: &Path, copy: &Path, limits: &PluginLimits) -> Result<()> {
     let folder = script.parent().unwrap_or(Path::new(""));
     if folder.join("vizflyt.py").exists() {
         bail!(
@@ -208,12 +233,10 @@ fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<(
             folder.join("vizflyt.py").display()
         );
     }
-    // Messages of the check show the path as the user typed it.
-    let path = absolute(script)?;
-    let folder = path.parent().unwrap_or(Path::new("/"));
-    let confinement = Confinement::prepare(limits, &[python.into(), path.clone().into()]);
+    let own = copy.parent().unwrap_or(Path::new("/"));
+    let confinement = Confinement::prepare(limits, &[python.into(), copy.into()]);
     let mut check = confinement.command(python);
-    check.args(["-c", CHECK]).args([&path, folder]);
+    check.args(["-c", CHECK]).args([copy, own]);
     check.stdout(Stdio::null()).stderr(Stdio::piped());
     let output = match confinement.run(check, CHECK_WITHIN) {
         Ok(output) => output,
@@ -231,6 +254,7 @@ fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<(
         return Ok(());
     }
     let words = String::from_utf8_lossy(&output.stderr);
+    let words = words.replace(&*copy.to_string_lossy(), &script.to_string_lossy());
     if let Some(mistake) = words.strip_prefix("cannot be compiled\n") {
         bail!("{} is not Python:\n{}", script.display(), mistake.trim_end());
     }
@@ -323,11 +347,11 @@ mod tests {
     fn uses_the_python_of_the_folder() {
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("plugin.py");
-        assert_eq!(python_of(&script), Path::new("python3"));
+        assert_eq!(python_of(&script).unwrap(), Path::new("python3"));
         fs::create_dir_all(folder.path().join(".venv/bin")).unwrap();
         let own = folder.path().join(".venv/bin/python3");
         fs::write(&own, "").unwrap();
-        assert_eq!(python_of(&script), own);
+        assert_eq!(python_of(&script).unwrap(), own);
     }
 
     #[test]
@@ -335,7 +359,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("plugin.py");
         fs::write(folder.path().join("vizflyt.py"), "").unwrap();
-        let error = check_python(Path::new("python3"), &script, &PluginLimits::default())
+        let error = check_python(Path::new("python3"), &script, &script, &PluginLimits::default())
             .unwrap_err()
             .to_string();
         assert!(error.contains("vizflyt.py hides the package"), "{error}");
@@ -346,7 +370,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("plugin.py");
         fs::write(&script, "import vizflyt\nclass First(vizflyt.Plugin:\n").unwrap();
-        let error = check_python(Path::new("python3"), &script, &PluginLimits::default())
+        let error = check_python(Path::new("python3"), &script, &script, &PluginLimits::default())
             .unwrap_err()
             .to_string();
         for part in ["plugin.py is not Python", "line 2", "class First", "SyntaxError"] {

@@ -353,9 +353,8 @@ fn cell(limits: &PluginLimits, command: &[OsString], own: &[PathBuf]) -> Result<
 /// Returns the student's folders by their given and their canonical paths.
 fn untrusted(limits: &PluginLimits, command: &[OsString]) -> Vec<(PathBuf, PathBuf)> {
     let folders = scripts(command).into_iter().chain(limits.untrusted.iter().cloned());
-    let both = |folder: PathBuf| {
-        Some((std::path::absolute(&folder).ok()?, folder.canonicalize().ok()?))
-    };
+    let both =
+        |folder: PathBuf| Some((std::path::absolute(&folder).ok()?, folder.canonicalize().ok()?));
     folders.filter_map(both).filter(|(_, folder)| is_somebodys(folder)).collect()
 }
 

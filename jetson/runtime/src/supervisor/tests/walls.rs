@@ -210,8 +210,11 @@ fn follows_no_link_out_of_a_students_folder() {
     ] {
         let _ = fs::remove_dir_all(&own);
         fs::create_dir_all(own.join(".venv/bin")).unwrap();
-        fs::write(&script, format!("import os; print(os.path.exists({:?}))", victim.join("secret")))
-            .unwrap();
+        fs::write(
+            &script,
+            format!("import os; print(os.path.exists({:?}))", victim.join("secret")),
+        )
+        .unwrap();
         let python = own.join(".venv/bin/python3");
         std::os::unix::fs::symlink(link, own.join(".venv").join(aim)).unwrap();
         let _ = std::os::unix::fs::symlink("/usr/bin/python3", &python);
