@@ -92,7 +92,8 @@ def graded_flights(scene):
     after = {path: path.read_bytes() for path in (report, junit)}
     check("grade: no daemon changes what was written", before == after, "changed")
     # It ran as a copy, in folders of the same names.
-    left = subprocess.run(["pgrep", "-f", f"{program.parent.name}/{program.name}"], capture_output=True, text=True, check=False).stdout
+    name = f"{program.parent.name}/{program.name}"
+    left = subprocess.run(["pgrep", "-f", name], capture_output=True, text=True, check=False).stdout
     check("grade: nothing of it runs on", not left, left)
     grade = json.loads(done.stdout)
     check("grade: it has no points", grade["summary"]["score"]["value"] < 50, grade["summary"])

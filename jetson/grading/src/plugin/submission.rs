@@ -150,10 +150,13 @@ impl OwnFiles {
     fn build(&mut self, limits: &PluginLimits, build: Option<&Path>) -> Result<()> {
         let (_folder, copy) = self.copy()?;
         let made = door::private_folder()?;
-        let target = build.unwrap_or(made.path()).canonicalize()?;
+        let outer = build.unwrap_or(made.path()).canonicalize()?;
+        // The build's user may enter this folder, but not the one around it.
+        let target = outer.join("build");
+        drop(Door::open(&outer)?.make(Path::new("build"))?);
         let project = cargo::ProjectCopy { root: &copy, target: &target };
         let program = cargo::build(&copy.join(&self.main), Some(&project), limits);
-        let program = program.with_context(|| self.root.join(&self.main).display().to_string())?;
+        let program = program.with_context(|| format!("{}", self.root.display()))?;
         let folder = program.parent().unwrap_or(&target);
         let name = program.file_name().unwrap_or_default();
         let mut read = |name: &OsStr| -> Result<()> {
