@@ -3,8 +3,7 @@
 //! ```text
 //! folder, ZIP archive ──▶ Files, in memory ──▶ a copy for check and build, a new copy for each flight
 //! ```
-//! Files of a student are links, devices or pipes only if the student attacks. They are rejected, and names that no
-//! plugin needs (`.git`, `target`) are left out.
+//! Links, devices, pipes and sockets are rejected. Names that no plugin needs (`.git`, `target`) are left out.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};

@@ -15,7 +15,7 @@ mod args;
 mod changes;
 pub mod class;
 pub mod document;
-pub mod door;
+mod door;
 mod figures;
 mod finished;
 mod flights;
