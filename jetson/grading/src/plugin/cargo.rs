@@ -166,17 +166,17 @@ impl Metadata {
     /// If it is a link: the build could write where the link leads. A folder outside the project is the user's choice.
     fn own_target(&self) -> Result<PathBuf> {
         let target = &self.target_directory;
-        match target.strip_prefix(&self.workspace_root) {
-            Ok(inner) => {
-                drop(Door::open(&self.workspace_root)?.make(inner).with_context(|| {
-                    format!(
-                        "cannot build in {}; remove it, or name another folder in CARGO_TARGET_DIR",
-                        target.display()
-                    )
-                })?)
-            }
-            Err(_) => fs::create_dir_all(target)
-                .with_context(|| format!("cannot make {}", target.display()))?,
+        if let Ok(inner) = target.strip_prefix(&self.workspace_root) {
+            let made = Door::open(&self.workspace_root)?.make(inner);
+            drop(made.with_context(|| {
+                format!(
+                    "cannot build in {}; remove it, or name another folder in CARGO_TARGET_DIR",
+                    target.display()
+                )
+            })?);
+        } else {
+            fs::create_dir_all(target)
+                .with_context(|| format!("cannot make {}", target.display()))?;
         }
         Ok(target.clone())
     }

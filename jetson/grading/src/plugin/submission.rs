@@ -69,12 +69,11 @@ impl<'a> Submission<'a> {
             (typed.canonicalize().with_context(cannot)?, main.components().collect())
         } else {
             let full = main.canonicalize().with_context(cannot)?;
-            match &plugin.kind {
-                PluginKind::Cargo(_) => (full, PathBuf::new()),
-                _ => {
-                    let name = full.file_name().with_context(cannot)?.into();
-                    (full.parent().with_context(cannot)?.to_owned(), name)
-                }
+            if let PluginKind::Cargo(_) = &plugin.kind {
+                (full, PathBuf::new())
+            } else {
+                let name = full.file_name().with_context(cannot)?.into();
+                (full.parent().with_context(cannot)?.to_owned(), name)
             }
         };
         let is_program = matches!(plugin.kind, PluginKind::Program(_));
