@@ -103,6 +103,9 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
         CheckCommand::Localization(args) => return localization::run(args),
     };
     let mut session = args.autopilot.open_session()?;
+    for neighbor in session.neighbors() {
+        print_line(format!("note     {neighbor}"));
+    }
     let has = session.read()?;
     let version = session.version()?;
     let firmware = session.link().firmware().map_or("ArduCopter".to_owned(), |f| f.to_string());

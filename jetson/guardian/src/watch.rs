@@ -11,14 +11,14 @@ use vizflyt_protocol::failsafe::{
 };
 use vizflyt_protocol::mavlink::dialect::{MavCmd, MavMessage, MavResult};
 use vizflyt_protocol::mavlink::{
-    GuidedMotion, GuidedSetpoint, MAX_PACKET, MavHeader, MavlinkVersion, Message, Signer,
-    SigningTime, StreamDecoder, Verifier, encode, guided_from_mavlink, guided_to_mavlink,
+    GuidedMotion, GuidedSetpoint, HeartbeatSender, MAX_PACKET, MavHeader, MavlinkVersion, Message,
+    Signer, SigningTime, StreamDecoder, Verifier, encode, guided_from_mavlink, guided_to_mavlink,
     vision_of_sample,
 };
 use vizflyt_protocol::messages::{PoseSample, YawTarget};
 use vizflyt_protocol::time::HostTime;
 
-use crate::port::{Wanted, is_flown};
+use crate::port::{Wanted, sender_of};
 
 /// Silence of the runtime that leads to LAND, while the vehicle follows the runtime. [ms]
 pub const SILENCE_MS: u16 = 500;
@@ -158,17 +158,18 @@ impl Watch {
             }
             is_heard |= *autopilot == Some((system, packet.header.component_id));
             match &packet.message {
-                MavMessage::HEARTBEAT(heartbeat) if is_flown(heartbeat.autopilot) => {
+                MavMessage::HEARTBEAT(heartbeat) => {
+                    let sender = sender_of(&packet.header, heartbeat);
+                    if !matches!(sender, HeartbeatSender::Multirotor { .. }) {
+                        return;
+                    }
                     if let (Some(verifier), Some(signing)) = (&mut *verifier, &wanted.signing)
                         && verifier.check(signing.start.plus_us(elapsed_us), bytes).is_err()
                     {
                         return;
                     }
-                    let flight = Flight::of(
-                        heartbeat.autopilot as u8,
-                        heartbeat.base_mode.bits(),
-                        heartbeat.custom_mode,
-                    );
+                    let flight =
+                        Flight::of(sender, heartbeat.base_mode.bits(), heartbeat.custom_mode);
                     beat = Some(((system, packet.header.component_id), flight));
                 }
                 MavMessage::COMMAND_ACK(ack) => {

@@ -7,7 +7,9 @@ use vizflyt_fixtures::CountingAllocator;
 use vizflyt_guardian::port::{Port, Wanted};
 use vizflyt_guardian::watch::{Out, Watch};
 use vizflyt_protocol::geometry::Pose;
-use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot, MavMessage, MavModeFlag};
+use vizflyt_protocol::mavlink::dialect::{
+    HEARTBEAT_DATA, MavAutopilot, MavMessage, MavModeFlag, MavType,
+};
 use vizflyt_protocol::mavlink::{
     GuidedMotion, GuidedSetpoint, MAX_PACKET, MavHeader, encode, guided_to_mavlink,
 };
@@ -53,6 +55,7 @@ fn does_not_allocate_after_the_start() {
     let up_len = packet((255, 191), &setpoint, &mut up);
     let beat = MavMessage::HEARTBEAT(HEARTBEAT_DATA {
         custom_mode: 4,
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
         ..HEARTBEAT_DATA::default()

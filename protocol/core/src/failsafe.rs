@@ -16,44 +16,44 @@
 //! landing some seconds later, with a pause. The heartbeat is not continued before the descent: if LAND is not
 //! received, that failsafe must land the vehicle.
 
-use crate::mavlink::CopterMode;
-use crate::mavlink::dialect::{COMMAND_LONG_DATA, MavAutopilot, MavCmd, MavModeFlag};
+use crate::mavlink::dialect::{COMMAND_LONG_DATA, MavCmd, MavModeFlag};
+use crate::mavlink::{CopterMode, HeartbeatSender};
 use crate::time::HostTime;
 
 /// State of the vehicle from the autopilot's heartbeat.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Flight {
     /// Whether the vehicle is armed.
     pub armed: bool,
     /// Mode number: `custom_mode` of the heartbeat.
     pub mode: u32,
-    /// Whether the autopilot is PX4, whose modes have other numbers.
-    pub px4: bool,
+    /// Sender of the heartbeat: PX4's modes have other numbers, and only multirotors are landed.
+    pub sender: HeartbeatSender,
 }
 
 impl Flight {
-    /// State before the first heartbeat. Equal to the default, but `const`.
-    pub const UNKNOWN: Self = Self { armed: false, mode: 0, px4: false };
+    /// State before the first heartbeat.
+    pub const UNKNOWN: Self = Self { armed: false, mode: 0, sender: HeartbeatSender::Device };
 
-    /// Returns the state from the fields of a heartbeat: `autopilot`, `base_mode`, `custom_mode`.
-    pub fn of(autopilot: u8, base_mode: u8, mode: u32) -> Self {
-        Self {
-            armed: base_mode & MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED.bits() != 0,
-            mode,
-            px4: autopilot == MavAutopilot::MAV_AUTOPILOT_PX4 as u8,
-        }
+    /// Returns the state from the sender of a heartbeat and its fields `base_mode` and `custom_mode`.
+    pub fn of(sender: HeartbeatSender, base_mode: u8, mode: u32) -> Self {
+        let armed = base_mode & MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED.bits() != 0;
+        Self { armed, mode, sender }
     }
 
     /// Whether the vehicle follows a companion's setpoints.
     pub fn follows(self) -> bool {
-        let mode = if self.px4 { PX4_OFFBOARD } else { CopterMode::Guided as u32 };
-        self.armed && self.mode == mode
+        self.is_in(CopterMode::Guided, PX4_OFFBOARD)
     }
 
     /// Whether the vehicle is landing by itself.
     pub fn lands(self) -> bool {
-        let mode = if self.px4 { PX4_LAND } else { CopterMode::Land as u32 };
-        self.armed && self.mode == mode
+        self.is_in(CopterMode::Land, PX4_LAND)
+    }
+
+    fn is_in(self, copter: CopterMode, px4_mode: u32) -> bool {
+        let HeartbeatSender::Multirotor { px4 } = self.sender else { return false };
+        self.armed && self.mode == if px4 { px4_mode } else { copter as u32 }
     }
 }
 
@@ -343,7 +343,8 @@ mod tests {
     use super::*;
 
     const RUNTIME: (u8, u8) = (255, 191);
-    const GUIDED: Flight = Flight { armed: true, mode: 4, px4: false };
+    const COPTER: HeartbeatSender = HeartbeatSender::Multirotor { px4: false };
+    const GUIDED: Flight = Flight { armed: true, mode: 4, sender: COPTER };
 
     fn at(ms: u64) -> HostTime {
         HostTime::from_ns(ms * 1_000_000)
@@ -385,7 +386,8 @@ mod tests {
         assert_eq!(landings(|_| GUIDED, 0, 20, 5000), []);
         // One target every 400 ms: a ground station.
         assert_eq!(landings(|_| GUIDED, 1000, 400, 5000), []);
-        let px4 = Flight { armed: true, mode: 6 << 16, px4: true };
+        let px4 = HeartbeatSender::Multirotor { px4: true };
+        let px4 = Flight { armed: true, mode: 6 << 16, sender: px4 };
         assert_eq!(landings(|_| px4, 1000, 20, 2200), [(2000, 0)]);
         // ArduCopter's mode number is not valid for PX4.
         assert_eq!(landings(|_| Flight { mode: 4, ..px4 }, 1000, 20, 5000), []);

@@ -2,7 +2,8 @@
 //! that it serves.
 
 use vizflyt_protocol::failsafe::Flight;
-use vizflyt_protocol::mavlink::dialect::{MavAutopilot, MavCmd, MavResult, MavSeverity};
+use vizflyt_protocol::mavlink::dialect::{MavCmd, MavResult, MavSeverity};
+use vizflyt_protocol::mavlink::{HeartbeatSender, heartbeat_sender};
 use vizflyt_protocol::time::HostTime;
 
 use super::fields::Fields;
@@ -76,14 +77,15 @@ impl PacketRouter {
         let field = Fields(packet.payload());
         match packet.id() {
             HEARTBEAT => {
-                let autopilot = field.byte(5);
-                if autopilot == MavAutopilot::MAV_AUTOPILOT_INVALID as u8 {
+                let source = packet.source();
+                let sender = heartbeat_sender(source.1, field.byte(4), field.byte(5));
+                if !self.is_autopilot(source, sender) {
                     return;
                 }
                 self.signing.note_heartbeat(packet);
-                self.autopilot = Some(packet.source());
+                self.autopilot = Some(source);
                 self.autopilot_at = now;
-                self.flight = Flight::of(autopilot, field.byte(6), field.u32(0));
+                self.flight = Flight::of(sender, field.byte(6), field.u32(0));
                 self.heartbeat = heapless::Vec::from_slice(packet.bytes()).unwrap_or_default();
             }
             COMMAND_ACK => {
@@ -102,6 +104,19 @@ impl PacketRouter {
                 }
             }
             _ => {}
+        }
+    }
+
+    /// Whether the sender of a heartbeat is the autopilot of this vehicle. The first one keeps its place until it is
+    /// silent, but a multirotor replaces another vehicle, for example an antenna tracker on the same line.
+    fn is_autopilot(&self, source: (u8, u8), sender: HeartbeatSender) -> bool {
+        let is_free = self.autopilot.is_none_or(|known| known == source);
+        match sender {
+            HeartbeatSender::Multirotor { .. } => {
+                is_free || self.flight.sender == HeartbeatSender::OtherVehicle
+            }
+            HeartbeatSender::OtherVehicle => is_free,
+            HeartbeatSender::Device => false,
         }
     }
 

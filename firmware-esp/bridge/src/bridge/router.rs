@@ -389,7 +389,7 @@ impl PacketRouter {
         }
         if self.autopilot.is_some() && now.seconds_since(self.autopilot_at) > LOST_AFTER_S {
             self.autopilot = None;
-            self.flight = Flight::default();
+            self.flight = Flight::UNKNOWN;
         }
         self.poll_component(now);
     }

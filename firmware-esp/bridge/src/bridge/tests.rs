@@ -7,7 +7,7 @@ use std::vec::Vec;
 use proptest::prelude::*;
 use vizflyt_protocol::mavlink::dialect::{
     ATTITUDE_DATA, COMMAND_ACK_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd,
-    MavMessage, MavModeFlag, MavResult, PARAM_SET_DATA, PARAM_VALUE_DATA,
+    MavMessage, MavModeFlag, MavResult, MavType, PARAM_SET_DATA, PARAM_VALUE_DATA,
     SET_POSITION_TARGET_LOCAL_NED_DATA, TIMESYNC_DATA,
 };
 use vizflyt_protocol::mavlink::{MavHeader, Message, Packet, StreamDecoder, encode};
@@ -38,6 +38,7 @@ pub(super) fn heartbeat(armed: bool, mode: u32) -> MavMessage {
     base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, armed);
     MavMessage::HEARTBEAT(HEARTBEAT_DATA {
         custom_mode: mode,
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         base_mode,
         ..Default::default()
@@ -312,6 +313,32 @@ fn a_slow_tcp_client_loses_only_its_own_oldest_packets() {
     assert_eq!(last.param_index, 399);
     bridge.close_stream(0);
     assert_eq!(bridge.clients().count(), 1);
+}
+
+fn heartbeat_of(mavtype: MavType) -> MavMessage {
+    MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+        custom_mode: 4,
+        mavtype,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
+        ..Default::default()
+    })
+}
+
+#[test]
+fn only_a_multirotor_counts_as_the_vehicle() {
+    let mut bridge = bridge(Settings::unnamed());
+    bridge.handle_uart(at(0), &bytes(0, (1, 154), &heartbeat_of(MavType::MAV_TYPE_GIMBAL)));
+    assert_eq!((bridge.autopilot(), bridge.is_armed()), (None, false));
+    // Another vehicle, so that stations find it, until a multirotor is heard.
+    let tracker = heartbeat_of(MavType::MAV_TYPE_ANTENNA_TRACKER);
+    bridge.handle_uart(at(1), &bytes(0, (2, 1), &tracker));
+    assert_eq!((bridge.autopilot(), bridge.is_armed()), (Some((2, 1)), true));
+    bridge.handle_uart(at(2), &bytes(1, AUTOPILOT, &heartbeat(false, 0)));
+    bridge.handle_uart(at(3), &bytes(2, (2, 1), &tracker));
+    bridge.handle_uart(at(4), &bytes(3, (1, 154), &heartbeat_of(MavType::MAV_TYPE_GIMBAL)));
+    bridge.handle_uart(at(5), &bytes(4, (7, 1), &heartbeat_of(MavType::MAV_TYPE_QUADROTOR)));
+    assert_eq!((bridge.autopilot(), bridge.is_armed()), (Some(AUTOPILOT), false));
 }
 
 #[test]

@@ -115,6 +115,9 @@ fn receive(source: &mut dyn PoseSource, gyro: Option<&mut Vehicle>) -> Option<Me
             print_line("vehicle  heartbeats of its autopilot received");
         }
         vehicle.clock_off_ms = heard.clock_off_ms;
+        if heard.wrong_vehicle.is_some() {
+            vehicle.wrong_vehicle = heard.wrong_vehicle;
+        }
         if heard.began_anew {
             vehicle.meter = DelayMeter::default();
         }
@@ -134,6 +137,7 @@ struct Vehicle {
     gyro: Gyro,
     meter: DelayMeter,
     was_connected: bool,
+    wrong_vehicle: Option<String>,
     /// Error bound of the gyroscope's times. [ms]
     clock_off_ms: Option<f64>,
 }
@@ -146,6 +150,9 @@ fn measure_delay(
     source: &mut dyn PoseSource,
     vehicle: &mut Vehicle,
 ) -> Result<(Delay, Option<f64>), String> {
+    if let Some(wrong) = vehicle.wrong_vehicle.take() {
+        return Err(wrong);
+    }
     if diagnosis.change.iter().any(|(key, _)| *key == "euler") {
         return Err("the delay needs correct angles: set `euler`, and repeat the check".to_owned());
     }
@@ -289,7 +296,13 @@ impl LocalizationArgs {
         let gyro = Gyro::open(&address, settings)?;
         print_line(format!("listens  {address} for the autopilot's gyroscope"));
         let meter = DelayMeter::default();
-        Ok(Some(Vehicle { gyro, meter, was_connected: false, clock_off_ms: None }))
+        Ok(Some(Vehicle {
+            gyro,
+            meter,
+            was_connected: false,
+            wrong_vehicle: None,
+            clock_off_ms: None,
+        }))
     }
 
     /// Returns the source of the command line, or the first of the arena, or Vicon.

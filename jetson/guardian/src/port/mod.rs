@@ -15,7 +15,7 @@ mod tcp;
 mod udp;
 
 use partner::Partner;
-pub(crate) use partner::is_flown;
+pub(crate) use partner::sender_of;
 pub use partner::{Intruder, IntruderFault, LinkSigning, Wanted};
 use serial::SerialPort;
 use tcp::TcpPort;

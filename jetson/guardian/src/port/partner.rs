@@ -9,8 +9,11 @@ use std::fmt;
 use std::net::{IpAddr, SocketAddr};
 use std::time::{Duration, Instant};
 
-use vizflyt_protocol::mavlink::dialect::{MavAutopilot, MavMessage};
-use vizflyt_protocol::mavlink::{SigningFault, SigningKey, SigningTime, StreamDecoder, Verifier};
+use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavMessage};
+use vizflyt_protocol::mavlink::{
+    HeartbeatSender, MavHeader, SigningFault, SigningKey, SigningTime, StreamDecoder, Verifier,
+    heartbeat_sender, heartbeat_sender_name,
+};
 
 /// Signing parameters for one run of the link.
 #[derive(Clone, Debug)]
@@ -38,6 +41,14 @@ pub enum IntruderFault {
     /// Not MAVLink, or not from an autopilot.
     #[error("they contain no heartbeat of an autopilot")]
     NoHeartbeat,
+    /// Heartbeat of a vehicle that is no multirotor.
+    #[error("they are from {name} (system {system}), not from a multirotor")]
+    NoMultirotor {
+        /// System id in the heartbeat.
+        system: u8,
+        /// Name of the vehicle type, with its article.
+        name: &'static str,
+    },
     /// Heartbeat of another vehicle.
     #[error("they contain heartbeats of system {found}, expected {wanted}")]
     OtherSystem {
@@ -52,6 +63,19 @@ pub enum IntruderFault {
     /// Heartbeat of a second sender, while there is a partner.
     #[error("the autopilot is at {0}")]
     Second(SocketAddr),
+    /// Heartbeat of a second autopilot, while there is a partner.
+    #[error(
+        "they are from a second autopilot, system {found}; the first, system {system}, is at {partner}; select one \
+         with `system` of [vehicle] in jetson.toml"
+    )]
+    SecondAutopilot {
+        /// System id of the second autopilot.
+        found: u8,
+        /// System id of the partner.
+        system: u8,
+        /// Address of the partner.
+        partner: SocketAddr,
+    },
 }
 
 /// Sender whose datagrams are ignored.
@@ -85,6 +109,8 @@ pub(super) struct Partner {
     verifier: Option<Verifier>,
     made_at: Instant,
     current: Option<(SocketAddr, Instant)>,
+    /// System id of the partner.
+    system: u8,
     /// Decoders per sender, newest last. A sender may cut packets anywhere, as a bridge of a serial line does.
     streams: Vec<Stream>,
     intruders: Vec<Remembered>,
@@ -124,6 +150,7 @@ impl Partner {
             verifier,
             made_at: now,
             current: None,
+            system: 0,
             streams: Vec::new(),
             intruders: Vec::new(),
         }
@@ -148,20 +175,28 @@ impl Partner {
         }
         let heartbeat = self.heartbeat(from, bytes, now);
         match (current, heartbeat) {
-            (Some((partner, _)), Ok(())) if partner == from => {
-                self.current = Some((from, now));
+            (Some((partner, _)), Ok(system)) if partner == from => {
+                (self.current, self.system) = (Some((from, now)), system);
                 true
             }
             // Other packets of the partner. Only heartbeats keep its place.
             (Some((partner, _)), Err(_)) if partner == from => true,
-            (Some((partner, at)), Ok(())) if now.duration_since(at) < PARTNER_KEPT => {
-                self.note(from, IntruderFault::Second(partner), now);
+            (Some((partner, at)), Ok(found)) if now.duration_since(at) < PARTNER_KEPT => {
+                let system = self.system;
+                let fault = if found == system {
+                    IntruderFault::Second(partner)
+                } else {
+                    IntruderFault::SecondAutopilot { found, system, partner }
+                };
+                self.note(from, fault, now);
                 false
             }
-            (_, Ok(())) => {
-                self.current = Some((from, now));
+            (_, Ok(system)) => {
+                (self.current, self.system) = (Some((from, now)), system);
                 true
             }
+            // Not the partner, so nothing is sent to it, but the link reports what it is.
+            (None, Err(IntruderFault::NoMultirotor { .. })) => true,
             (_, Err(fault)) => {
                 self.note(from, fault, now);
                 false
@@ -186,13 +221,13 @@ impl Partner {
         Some(due.intruder)
     }
 
-    /// Returns `Ok` if a heartbeat of the wanted autopilot ends in these bytes.
+    /// Returns the system id of the wanted autopilot if one of its heartbeats ends in these bytes.
     fn heartbeat(
         &mut self,
         from: SocketAddr,
         bytes: &[u8],
         now: Instant,
-    ) -> Result<(), IntruderFault> {
+    ) -> Result<u8, IntruderFault> {
         let mut found = Err(IntruderFault::NoHeartbeat);
         let (wanted, verifier) = (&self.wanted, &mut self.verifier);
         let elapsed_us = now.duration_since(self.made_at).as_micros() as u64;
@@ -203,7 +238,8 @@ impl Partner {
         };
         stream.decoder.push_whole(bytes, |bytes, packet| {
             let MavMessage::HEARTBEAT(heartbeat) = &packet.message else { return };
-            if found.is_ok() || !is_flown(heartbeat.autopilot) {
+            let sender = sender_of(&packet.header, heartbeat);
+            if found.is_ok() || sender == HeartbeatSender::Device {
                 return;
             }
             // As in the link: system ids above 255 are invalid.
@@ -214,11 +250,20 @@ impl Partner {
                 found = Err(IntruderFault::OtherSystem { found: system, wanted });
                 return;
             }
-            found = match (&wanted.signing, verifier.as_mut()) {
-                (Some(signing), Some(verifier)) => verifier
-                    .check(signing.start.plus_us(elapsed_us), bytes)
-                    .map_err(IntruderFault::NotSigned),
+            let verdict = match (&wanted.signing, verifier.as_mut()) {
+                (Some(signing), Some(verifier)) => {
+                    verifier.check(signing.start.plus_us(elapsed_us), bytes)
+                }
                 _ => Ok(()),
+            };
+            found = match (verdict, sender) {
+                (Err(fault), _) => Err(IntruderFault::NotSigned(fault)),
+                (Ok(()), HeartbeatSender::Multirotor { .. }) => Ok(system),
+                (Ok(()), _) => {
+                    let component = packet.header.component_id;
+                    let name = heartbeat_sender_name(component, heartbeat.mavtype);
+                    Err(IntruderFault::NoMultirotor { system, name })
+                }
             };
         });
         // Evict the sender that has been silent longest, but never the partner.
@@ -251,9 +296,9 @@ impl Partner {
     }
 }
 
-/// Whether VizFlyt supports this autopilot.
-pub(crate) fn is_flown(autopilot: MavAutopilot) -> bool {
-    matches!(autopilot, MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA | MavAutopilot::MAV_AUTOPILOT_PX4)
+/// Returns the sender of a heartbeat.
+pub(crate) fn sender_of(header: &MavHeader, heartbeat: &HEARTBEAT_DATA) -> HeartbeatSender {
+    heartbeat_sender(header.component_id, heartbeat.mavtype as u8, heartbeat.autopilot as u8)
 }
 
 /// Time without a heartbeat after which another sender may replace the partner.
@@ -270,16 +315,19 @@ const LONGEST_PAUSE: Duration = Duration::from_hours(1);
 pub(super) mod tests {
     use super::*;
     use proptest::prelude::*;
-    use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, RADIO_STATUS_DATA};
-    use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, Signer, encode};
+    use vizflyt_protocol::mavlink::dialect::{MavAutopilot, MavType, RADIO_STATUS_DATA};
+    use vizflyt_protocol::mavlink::{MAX_PACKET, Signer, encode};
 
     const SECOND: Duration = Duration::from_secs(1);
 
     /// Returns a heartbeat of ArduPilot, signed if there is a signer.
     pub(crate) fn heartbeat(system: u8, signer: Option<(&mut Signer, SigningTime)>) -> Vec<u8> {
+        packet(system, &beat(MavType::MAV_TYPE_QUADROTOR), signer)
+    }
+
+    fn beat(mavtype: MavType) -> MavMessage {
         let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
-        let message = MavMessage::HEARTBEAT(HEARTBEAT_DATA { autopilot, ..Default::default() });
-        packet(system, &message, signer)
+        MavMessage::HEARTBEAT(HEARTBEAT_DATA { mavtype, autopilot, ..Default::default() })
     }
 
     fn packet(
@@ -355,6 +403,23 @@ pub(super) mod tests {
         let other = IntruderFault::OtherSystem { found: 7, wanted: 3 };
         assert_eq!(faults, [IntruderFault::NoHeartbeat, other]);
         assert!(partner.accept(from(3, 1), &heartbeat(3, None), start));
+    }
+
+    #[test]
+    fn a_rover_is_reported_but_gets_no_reply() {
+        let (start, rover, copter) = (Instant::now(), from(1, 1), from(2, 1));
+        let beat = packet(7, &beat(MavType::MAV_TYPE_GROUND_ROVER), None);
+        let mut partner = Partner::waited_for(Wanted::default(), start);
+        assert!(partner.accept(rover, &beat, start), "the link reports it");
+        assert_eq!(partner.address(), None);
+        assert!(partner.accept(copter, &heartbeat(1, None), start));
+        assert!(!partner.accept(rover, &beat, start));
+        assert_eq!(partner.address(), Some(copter));
+        let named = partner.poll_intruder(start).unwrap().to_string();
+        assert!(named.contains("a rover (system 7), not from a multirotor"), "{named}");
+        assert!(!partner.accept(from(3, 1), &heartbeat(2, None), start));
+        let named = partner.poll_intruder(start).unwrap().to_string();
+        assert!(named.contains("a second autopilot, system 2; the first, system 1"), "{named}");
     }
 
     #[test]

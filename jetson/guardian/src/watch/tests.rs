@@ -99,6 +99,7 @@ impl Rig {
         base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, self.armed);
         let beat = HEARTBEAT_DATA {
             custom_mode: self.mode,
+            mavtype: MavType::MAV_TYPE_QUADROTOR,
             autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
             base_mode,
             ..HEARTBEAT_DATA::default()
@@ -245,9 +246,15 @@ fn ignores_heartbeats_of_another_autopilot() {
     let mut rig = Rig::flying();
     // System 7 reports that it is disarmed.
     let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
-    let beat = HEARTBEAT_DATA { autopilot, ..HEARTBEAT_DATA::default() };
-    let other = rig.packet((7, 1), &MavMessage::HEARTBEAT(beat));
-    rig.watch.handle_autopilot(at(rig.ms), &other);
+    for (from, mavtype) in [
+        ((7, 1), MavType::MAV_TYPE_QUADROTOR),
+        ((1, 154), MavType::MAV_TYPE_GIMBAL),
+        ((1, 1), MavType::MAV_TYPE_ANTENNA_TRACKER),
+    ] {
+        let beat = HEARTBEAT_DATA { mavtype, autopilot, ..HEARTBEAT_DATA::default() };
+        let other = rig.packet(from, &MavMessage::HEARTBEAT(beat));
+        rig.watch.handle_autopilot(at(rig.ms), &other);
+    }
     rig.speaks_until = 2000;
     rig.run(2600);
     assert!(!rig.ours(COMMAND_LONG, 0).is_empty());

@@ -11,7 +11,7 @@ use super::names::Version;
 use crate::link::{
     FenceEvent, FencePolygon, Firmware, Link, LinkEvent, LinkSettings, LinkSigning, ParamEvent,
 };
-use vizflyt_guardian::port::{MavlinkAddress, Port};
+use vizflyt_guardian::port::{IntruderFault, MavlinkAddress, Port};
 
 /// Error of a session.
 #[derive(Debug, thiserror::Error)]
@@ -32,6 +32,9 @@ pub enum ParamSessionError {
         /// Timeout. [s]
         within_s: f64,
     },
+    /// A vehicle that is no multirotor, or several multirotors; with what to do.
+    #[error("{0}")]
+    Vehicle(String),
     /// Parameters are missing.
     #[error(
         "the autopilot did not send its parameters within {within_s} s; {received} came; try again nearer or by USB"
@@ -54,12 +57,20 @@ pub enum ParamSessionError {
 pub struct ParamSession {
     port: Port,
     link: Link,
+    /// Names of other senders on the link, for the user.
+    neighbors: Vec<String>,
+    /// Second autopilot that sends to the port from another address.
+    second: Option<String>,
 }
 
 /// Timeout of a heartbeat; one is sent every second. [s]
 const HEARTBEAT_WITHIN_S: f64 = 8.0;
 /// Timeout of the version, which arrives after the streams are configured. [s]
 const VERSION_WITHIN_S: f64 = 4.0;
+/// Timeout of a multirotor's heartbeat, if another vehicle sends heartbeats. [s]
+const OTHERS_WITHIN_S: f64 = 3.0;
+/// Time in which a second autopilot sends at least one heartbeat. [s]
+const ALONE_S: f64 = 1.2;
 /// Timeout of all parameters: a thousand at 57600 baud, with losses. [s]
 const LIST_WITHIN_S: f64 = 90.0;
 /// Timeout of one write, which is requested five times. [s]
@@ -73,20 +84,36 @@ impl ParamSession {
     /// Opens the port, and waits for a heartbeat and the version.
     ///
     /// # Errors
-    /// [`ParamSessionError::Open`], [`ParamSessionError::NoHeartbeat`].
+    /// [`ParamSessionError::Open`], [`ParamSessionError::NoHeartbeat`], [`ParamSessionError::Vehicle`].
     pub fn open(
         address: &MavlinkAddress,
         settings: LinkSettings,
     ) -> Result<Self, ParamSessionError> {
         let port = Port::open(address, settings.wanted())
             .map_err(|why| ParamSessionError::Open { address: address.clone(), why })?;
-        let mut session = Self { port, link: Link::with(host_now(), settings) };
+        let link = Link::with(host_now(), settings);
+        let mut session = Self { port, link, neighbors: Vec::new(), second: None };
         let within_s = HEARTBEAT_WITHIN_S;
-        session
-            .until(within_s, |_, link| link.is_connected().then_some(()))
-            .ok_or_else(|| ParamSessionError::NoHeartbeat { address: address.clone(), within_s })?;
+        let connected = |_: Option<&LinkEvent>, link: &Link| link.is_connected().then_some(());
+        if session.until(OTHERS_WITHIN_S, connected).is_none() {
+            if let Some(wrong) = session.link.wrong_vehicle(host_now()) {
+                return Err(ParamSessionError::Vehicle(wrong));
+            }
+            session.until(within_s - OTHERS_WITHIN_S, connected).ok_or_else(|| {
+                ParamSessionError::NoHeartbeat { address: address.clone(), within_s }
+            })?;
+        }
+        session.until(ALONE_S, |_, link| link.several(host_now()).map(|_| ()));
+        if let Some(several) = session.link.several(host_now()).or_else(|| session.second.take()) {
+            return Err(ParamSessionError::Vehicle(several));
+        }
         session.until(VERSION_WITHIN_S, |_, link| link.firmware().map(|_| ()));
         Ok(session)
+    }
+
+    /// Returns what other senders of heartbeats are on the link, one sentence each.
+    pub fn neighbors(&self) -> &[String] {
+        &self.neighbors
     }
 
     /// Returns the link: the state of the autopilot.
@@ -221,6 +248,9 @@ impl ParamSession {
             self.transmit();
             if let Some(intruder) = self.port.poll_intruder() {
                 tracing::warn!("mavlink: {intruder}");
+                if let IntruderFault::SecondAutopilot { .. } = intruder.fault {
+                    self.second = Some(intruder.to_string());
+                }
             }
             // A failed socket receives nothing; the timeout reports it.
             if let Ok(Some(len)) = self.port.receive(&mut buffer) {
@@ -228,6 +258,9 @@ impl ParamSession {
                 self.transmit();
             }
             while let Some(event) = self.link.poll_event() {
+                if let LinkEvent::Neighbor(text) = &event {
+                    self.neighbors.push(text.clone());
+                }
                 if let Some(result) = done(Some(&event), &self.link) {
                     return Some(result);
                 }
@@ -243,5 +276,59 @@ impl ParamSession {
         while let Some(datagram) = self.link.poll_transmit() {
             self.port.send(&datagram);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::UdpSocket;
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    use super::*;
+    use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot, MavMessage, MavType};
+    use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, encode};
+
+    /// Opens a session with the senders of these heartbeats (system, type), each with its own address.
+    fn open_with(
+        vehicles: &[(u8, MavType)],
+        settings: LinkSettings,
+    ) -> Result<ParamSession, String> {
+        let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let is_done = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            for &(system, mavtype) in vehicles {
+                let is_done = &is_done;
+                scope.spawn(move || {
+                    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+                    let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
+                    let beat = HEARTBEAT_DATA { mavtype, autopilot, ..Default::default() };
+                    let header =
+                        MavHeader { system_id: system.into(), component_id: 1, sequence: 0 };
+                    let mut bytes = [0; MAX_PACKET];
+                    let packet = encode(header, &MavMessage::HEARTBEAT(beat), &mut bytes);
+                    while !is_done.load(Ordering::Relaxed) {
+                        let _ = socket.send_to(packet, ("127.0.0.1", port));
+                        std::thread::sleep(Duration::from_millis(50));
+                    }
+                });
+            }
+            let address = format!("udpin:127.0.0.1:{port}").parse().unwrap();
+            let session = ParamSession::open(&address, settings);
+            is_done.store(true, Ordering::Relaxed);
+            session.map_err(|error| error.to_string())
+        })
+    }
+
+    #[test]
+    fn refuses_another_vehicle_and_two_multirotors() {
+        let usual = LinkSettings::default;
+        let rover = open_with(&[(3, MavType::MAV_TYPE_GROUND_ROVER)], usual()).err().unwrap();
+        assert!(rover.contains("system 3 is a rover, not a multirotor"), "{rover}");
+        let copters = [(1, MavType::MAV_TYPE_QUADROTOR), (2, MavType::MAV_TYPE_HEXAROTOR)];
+        let two = open_with(&copters, usual()).err().unwrap();
+        assert!(two.contains("system 1") && two.contains("system 2"), "{two}");
+        assert!(two.contains("select one with `system`"), "{two}");
+        let selected = LinkSettings { system: Some(2), ..usual() };
+        assert_eq!(open_with(&copters, selected).unwrap().link().system(), Some(2));
     }
 }

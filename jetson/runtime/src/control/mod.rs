@@ -310,6 +310,7 @@ impl ControlLoop {
             }
             match &event {
                 LinkEvent::Text { text, .. } => tracing::info!("autopilot: {text}"),
+                LinkEvent::Neighbor(text) => tracing::info!("link: {text}"),
                 event => tracing::info!("link: {event:?}"),
             }
         }

@@ -54,9 +54,14 @@ impl Companions {
         self.own
     }
 
+    /// Whether a heartbeat is an echo of ours.
+    pub(super) fn is_echo(&self, from: (u8, u8), heartbeat: &HEARTBEAT_DATA) -> bool {
+        from == (SYSTEM_ID, COMPONENT_ID) && heartbeat.custom_mode == self.own
+    }
+
     /// Handles a heartbeat that is not from the autopilot.
     pub(super) fn heartbeat(&mut self, now: HostTime, from: (u8, u8), heartbeat: &HEARTBEAT_DATA) {
-        let echo = from == (SYSTEM_ID, COMPONENT_ID) && heartbeat.custom_mode == self.own;
+        let echo = self.is_echo(from, heartbeat);
         let companion = heartbeat.mavtype == MavType::MAV_TYPE_ONBOARD_CONTROLLER
             && COMPANIONS.contains(&from.1);
         if companion && !echo {

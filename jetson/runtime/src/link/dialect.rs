@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::fmt::Debug;
 
 use vizflyt_protocol::mavlink::CopterMode;
-use vizflyt_protocol::mavlink::dialect::{MavAutopilot, MavParamType};
+use vizflyt_protocol::mavlink::dialect::MavParamType;
 
 use super::params::Param;
 use crate::guard::Response;
@@ -53,13 +53,9 @@ pub(super) trait Dialect: Debug + Send + Sync {
     fn value_to_wire(&self, value: f64, kind: MavParamType) -> f32;
 }
 
-/// Returns the dialect of an autopilot; `None` if it is not supported.
-pub(super) fn of(autopilot: MavAutopilot) -> Option<&'static dyn Dialect> {
-    match autopilot {
-        MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA => Some(&ArduCopter),
-        MavAutopilot::MAV_AUTOPILOT_PX4 => Some(&Px4),
-        _ => None,
-    }
+/// Returns the dialect of PX4 or ArduCopter.
+pub(super) fn of(px4: bool) -> &'static dyn Dialect {
+    if px4 { &Px4 } else { &ArduCopter }
 }
 
 /// ArduCopter 4.5 and later.

@@ -18,6 +18,8 @@ pub enum LinkEvent {
         /// System id of the autopilot.
         system: u8,
     },
+    /// Another sender of heartbeats appeared: what it is, as a sentence.
+    Neighbor(String),
     /// No packet of the autopilot for 3 s.
     Lost,
     /// The autopilot restarted.

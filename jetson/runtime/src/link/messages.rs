@@ -8,7 +8,7 @@ use vizflyt_protocol::time::HostTime;
 
 use super::commands::Command;
 use super::dialect::Rise;
-use super::{LOST_AFTER_S, Link, events};
+use super::{Link, events};
 
 /// Maximum age of an autopilot's text that explains a rejection. [s]
 const TEXT_WINDOW_S: f64 = 3.0;
@@ -20,21 +20,16 @@ impl Link {
     pub(super) fn missing(&self, now: HostTime) -> Option<Cow<'static, str>> {
         if self.autopilot.is_none() {
             let refused = self.signatures.as_ref().map_or(0, super::Signatures::refused);
-            return Some(if refused > 0 {
+            return Some(if let Some(wrong) = self.wrong_vehicle(now) {
+                wrong.into()
+            } else if refused > 0 {
                 "packets arrive, but not signed with our key; run `vizflyt vehicle sign`".into()
             } else {
                 "no heartbeat from an autopilot; check power, link and --mavlink".into()
             });
         }
-        if let Some((rival, at)) = self.rival
-            && now.seconds_since(at) < LOST_AFTER_S
-        {
-            let ours = self.system().unwrap_or(0);
-            let text = format!(
-                "two autopilots are on this link, systems {ours} and {rival}; select one with \
-                 `system` of [vehicle] in jetson.toml"
-            );
-            return Some(text.into());
+        if let Some(several) = self.several(now) {
+            return Some(several.into());
         }
         if let Some(other) = self.companions.other(now) {
             let text = format!("{other} commands this vehicle too; stop one of the two");

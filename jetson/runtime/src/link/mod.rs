@@ -25,6 +25,7 @@ mod goal;
 mod identity;
 mod messages;
 mod navigation;
+mod neighbors;
 mod own_mode;
 mod params;
 mod rates;
@@ -59,6 +60,7 @@ pub use goal::Goal;
 pub use identity::{COMPONENT_ID, Firmware, SYSTEM_ID};
 use navigation::Feed;
 pub use navigation::{Delay, VISION_HZ};
+use neighbors::Neighbors;
 use own_mode::OwnMode;
 use params::Params;
 pub use params::{Param, ParamEvent, same};
@@ -192,8 +194,7 @@ pub struct Link {
     firmware: Option<Firmware>,
     /// Whether the autopilot signs its packets.
     autopilot_signs: bool,
-    /// System id of another autopilot on the same link, and the time of its last packet.
-    rival: Option<(u8, HostTime)>,
+    neighbors: Neighbors,
     companions: Companions,
     announced_at: Option<HostTime>,
     received_at: HostTime,
@@ -255,7 +256,7 @@ impl Link {
             dialect: &dialect::ArduCopter,
             firmware: None,
             autopilot_signs: false,
-            rival: None,
+            neighbors: Neighbors::default(),
             companions: Companions::new(nonce),
             announced_at: None,
             received_at: now,
@@ -437,6 +438,27 @@ impl Link {
     /// Returns the autopilot's system id.
     pub fn system(&self) -> Option<u8> {
         self.autopilot.map(|target| target.system)
+    }
+
+    /// Returns that several multirotors are on the link, and how to select one; `None` if one is selected.
+    pub fn several(&self, now: HostTime) -> Option<String> {
+        let mut systems = self.neighbors.multirotors(now);
+        let ours = self.system().filter(|_| self.settings.system.is_none())?;
+        let others = systems.len();
+        systems.push(ours);
+        systems.sort_unstable();
+        let list = systems.iter().map(u8::to_string).collect::<Vec<_>>();
+        let (last, first) = list.split_last().filter(|_| others > 0)?;
+        Some(format!(
+            "several multirotors are on this link, systems {} and {last}; select one with `system` of [vehicle] in \
+             jetson.toml",
+            first.join(", ")
+        ))
+    }
+
+    /// Returns why a vehicle on the link cannot be flown, if it is the only one.
+    pub fn wrong_vehicle(&self, now: HostTime) -> Option<String> {
+        if self.is_connected() { None } else { self.neighbors.wrong_vehicle(now) }
     }
 
     /// Returns the autopilot's firmware, after the autopilot has reported it.

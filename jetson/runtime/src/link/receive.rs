@@ -11,9 +11,9 @@ use vizflyt_protocol::mavlink::dialect::{
     MavModeFlag, MavSysStatusSensor, STATUSTEXT_DATA, SYS_STATUS_DATA, TIMESYNC_DATA,
 };
 use vizflyt_protocol::mavlink::{
-    CopterMode, GlobalPoint, Message, Packet, attitude_from_mavlink, fence_corner_to_mavlink,
-    fence_request_from_mavlink, highres_imu_from_mavlink, local_position_from_mavlink,
-    raw_imu_from_mavlink,
+    CopterMode, GlobalPoint, HeartbeatSender, Message, Packet, attitude_from_mavlink,
+    fence_corner_to_mavlink, fence_request_from_mavlink, heartbeat_sender,
+    highres_imu_from_mavlink, local_position_from_mavlink, raw_imu_from_mavlink,
 };
 use vizflyt_protocol::packet::MAX_IMU;
 use vizflyt_protocol::time::{AutopilotTime, HostTime, OffsetFilter};
@@ -116,13 +116,24 @@ impl Link {
     }
 
     fn handle_heartbeat(&mut self, now: HostTime, from: Target, heartbeat: &HEARTBEAT_DATA) {
-        let Some(dialect) = dialect::of(heartbeat.autopilot) else {
-            return self.companions.heartbeat(now, (from.system, from.component), heartbeat);
+        let Target { system, component } = from;
+        let sender =
+            heartbeat_sender(component, heartbeat.mavtype as u8, heartbeat.autopilot as u8);
+        let HeartbeatSender::Multirotor { px4 } = sender else {
+            self.companions.heartbeat(now, (system, component), heartbeat);
+            if !self.companions.is_echo((system, component), heartbeat)
+                && let Some(line) = self.neighbors.heartbeat(now, from, heartbeat)
+            {
+                self.events.push_back(LinkEvent::Neighbor(line));
+            }
+            return;
         };
+        let dialect = dialect::of(px4);
         let ours = self.settings.system.is_none_or(|system| system == from.system);
         match self.autopilot {
             None if ours => {
                 self.autopilot = Some(from);
+                self.neighbors.remove(from);
                 self.dialect = dialect;
                 self.forget();
                 self.params.read(dialect.watched());
@@ -133,9 +144,7 @@ impl Link {
             }
             Some(known) if known == from => {}
             _ => {
-                if self.settings.system.is_none() {
-                    self.rival = Some((from.system, now));
-                }
+                self.neighbors.heartbeat(now, from, heartbeat);
                 return;
             }
         }

@@ -9,6 +9,7 @@ mod imu;
 mod px4;
 mod refusals;
 mod signed;
+mod vehicles;
 
 use glam::DVec3;
 use glam::{DQuat, Vec3};
@@ -496,6 +497,7 @@ fn ignores_packets_of_other_senders_on_the_network() {
     assert!(!script.link.is_connected());
     script.heartbeat();
     let armed = HEARTBEAT_DATA {
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
         ..Default::default()
@@ -580,6 +582,7 @@ fn telemetry(script: &mut Script) -> Vec<u8> {
     let messages = [
         MavMessage::HEARTBEAT(HEARTBEAT_DATA {
             custom_mode: 4,
+            mavtype: MavType::MAV_TYPE_QUADROTOR,
             autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
             base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
             ..Default::default()

@@ -8,6 +8,7 @@ mod command;
 mod distance;
 mod fence;
 mod frames;
+mod heartbeat;
 mod setpoint;
 mod signing;
 mod state;
@@ -27,6 +28,7 @@ pub use frames::{
     body_from_frd, frd_from_body, ned_from_world, ned_rotation_from_world, world_from_ned,
     world_rotation_from_ned, yaw_ned_from_world, yaw_world_from_ned,
 };
+pub use heartbeat::{HeartbeatSender, heartbeat_sender, heartbeat_sender_name};
 pub use setpoint::{
     GuidedMotion, GuidedSetpoint, UnsupportedSetpoint, guided_from_mavlink, guided_to_mavlink,
 };

@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 use vizflyt_e2e::{Demo, vizflyt};
 use vizflyt_protocol::mavlink::dialect::{
-    ATTITUDE_DATA, HEARTBEAT_DATA, MavAutopilot, MavMessage, MavModeFlag, PARAM_VALUE_DATA,
-    VISION_POSITION_ESTIMATE_DATA,
+    ATTITUDE_DATA, HEARTBEAT_DATA, MavAutopilot, MavMessage, MavModeFlag, MavType,
+    PARAM_VALUE_DATA, VISION_POSITION_ESTIMATE_DATA,
 };
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, StreamDecoder, encode};
 
@@ -73,6 +73,7 @@ fn heartbeat(armed: bool) -> MavMessage {
     base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, armed);
     MavMessage::HEARTBEAT(HEARTBEAT_DATA {
         custom_mode: 4,
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         base_mode,
         ..Default::default()

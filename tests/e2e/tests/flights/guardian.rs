@@ -11,7 +11,9 @@ use vizflyt_e2e::vizflyt;
 use vizflyt_guardian::client::BUFFER;
 use vizflyt_guardian::port::Wanted;
 use vizflyt_guardian::{Guardian, Message};
-use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot, MavMessage, MavModeFlag};
+use vizflyt_protocol::mavlink::dialect::{
+    HEARTBEAT_DATA, MavAutopilot, MavMessage, MavModeFlag, MavType,
+};
 use vizflyt_protocol::mavlink::{
     GuidedMotion, GuidedSetpoint, MAX_PACKET, MavHeader, StreamDecoder, encode, guided_to_mavlink,
 };
@@ -32,6 +34,7 @@ fn heartbeat(mode: u32, armed: bool) -> Vec<u8> {
     base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, armed);
     let beat = HEARTBEAT_DATA {
         custom_mode: mode,
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         base_mode,
         ..HEARTBEAT_DATA::default()

@@ -22,6 +22,8 @@ pub(super) struct Heard {
     pub(super) readings: Vec<(f64, DVec3)>,
     /// Whether heartbeats of an autopilot arrive.
     pub(super) is_connected: bool,
+    /// Why the vehicle on the link cannot be used: no multirotor, or several.
+    pub(super) wrong_vehicle: Option<String>,
     /// Error bound of the times; `None` if the autopilot's clock is unknown and times of arrival
     /// are used. [ms]
     pub(super) clock_off_ms: Option<f64>,
@@ -92,6 +94,8 @@ fn listen(port: &Port, mut link: Link, heard: &Mutex<Heard>, stop: &AtomicBool) 
         let clock_off_ms = link.clock().error_bound_ns(host_now()).map(|ns| ns as f64 * 1e-6);
         let mut heard = lock(heard);
         heard.is_connected = link.is_connected();
+        let now = host_now();
+        heard.wrong_vehicle = link.several(now).or_else(|| link.wrong_vehicle(now));
         if clock_off_ms.is_some() && !is_timed {
             is_timed = true;
             heard.began_anew = true;

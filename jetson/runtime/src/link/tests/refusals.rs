@@ -264,6 +264,7 @@ fn selects_one_of_two_vehicles() {
     script.run(2.0);
     assert!(!script.link.is_connected(), "system 1 is not selected");
     let beat = HEARTBEAT_DATA {
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         ..Default::default()
     };

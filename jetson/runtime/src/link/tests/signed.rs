@@ -19,6 +19,7 @@ fn link(now: HostTime) -> Link {
 fn beat(signer: Option<&mut Signer>, at: SigningTime) -> Vec<u8> {
     let header = MavHeader { system_id: 1, component_id: 1, sequence: 0 };
     let heartbeat = HEARTBEAT_DATA {
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
         ..Default::default()

@@ -5,17 +5,20 @@
 //! from each sender. Stamps are the autopilot's time since boot, which [`super::sender_clock`] maps to the
 //! server's clock. A vehicle's object is its system id; a single vehicle accepts any.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 
 use glam::{DQuat, DVec3};
 use vizflyt_arena::config::MAX_VEHICLES;
 use vizflyt_arena::pose::PoseSigma;
 use vizflyt_protocol::mavlink::dialect::{
-    ATTITUDE_QUATERNION_DATA, COMMAND_LONG_DATA, MavCmd, MavFrame, MavMessage, ODOMETRY_DATA,
+    ATTITUDE_QUATERNION_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, MavCmd, MavFrame, MavMessage,
+    ODOMETRY_DATA,
 };
 use vizflyt_protocol::mavlink::{
-    MAX_PACKET, MavHeader, Packet, StreamDecoder, attitude_from_mavlink, body_from_frd, encode,
-    local_position_from_mavlink, world_from_ned, world_rotation_from_ned,
+    HeartbeatSender, MAX_PACKET, MavHeader, Packet, StreamDecoder, attitude_from_mavlink,
+    body_from_frd, encode, heartbeat_sender, heartbeat_sender_name, local_position_from_mavlink,
+    world_from_ned, world_rotation_from_ned,
 };
 use vizflyt_protocol::time::ServerTime;
 
@@ -33,6 +36,8 @@ pub struct MavlinkStream {
     packets: Vec<Packet>,
     systems: Vec<System>,
     asks: u8,
+    /// Systems whose heartbeats name another vehicle than a multirotor.
+    refused: BTreeSet<u8>,
 }
 
 /// State of one vehicle's autopilot.
@@ -62,7 +67,7 @@ impl MavlinkStream {
         let names = VehicleNames::new(config, source, vehicles);
         let systems = vec![System::default(); names.len().min(MAX_VEHICLES)];
         let decoder = StreamDecoder::default();
-        Self { names, decoder, packets: Vec::new(), systems, asks: 0 }
+        Self { names, decoder, packets: Vec::new(), systems, asks: 0, refused: BTreeSet::new() }
     }
 
     fn vehicle_of(&self, header: MavHeader) -> Option<usize> {
@@ -81,6 +86,12 @@ impl MavlinkStream {
         );
         // Ground stations and companions of the same system have other component numbers.
         if !relevant || packet.header.component_id != AUTOPILOT {
+            return;
+        }
+        if let MavMessage::HEARTBEAT(heartbeat) = &packet.message {
+            self.note_type(packet.header, heartbeat);
+        }
+        if self.refused.contains(&(packet.header.system_id as u8)) {
             return;
         }
         let Some(vehicle) = self.vehicle_of(packet.header) else {
@@ -122,6 +133,21 @@ impl MavlinkStream {
             }
             MavMessage::ODOMETRY(message) => self.handle_odometry(vehicle, now, message),
             _ => {}
+        }
+    }
+
+    /// Refuses the packets of a system that is no multirotor, such as an antenna tracker or a rover.
+    fn note_type(&mut self, header: MavHeader, heartbeat: &HEARTBEAT_DATA) {
+        let (system, mavtype) = (header.system_id as u8, heartbeat.mavtype);
+        let sender =
+            heartbeat_sender(header.component_id, mavtype as u8, heartbeat.autopilot as u8);
+        if sender != HeartbeatSender::OtherVehicle {
+            self.refused.remove(&system);
+        } else if self.refused.insert(system) {
+            let name = heartbeat_sender_name(header.component_id, mavtype);
+            self.names.warn(format!(
+                "mavlink: system {system} is {name}, not a multirotor with ArduPilot or PX4; its poses are ignored"
+            ));
         }
     }
 

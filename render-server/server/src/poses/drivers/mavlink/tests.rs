@@ -1,6 +1,6 @@
 use super::*;
 use proptest::prelude::*;
-use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA};
+use vizflyt_protocol::mavlink::dialect::{LOCAL_POSITION_NED_DATA, MavAutopilot, MavType};
 use vizflyt_protocol::mavlink::{
     attitude_to_mavlink, local_position_to_mavlink, ned_rotation_from_world,
 };
@@ -107,13 +107,33 @@ fn distinguishes_systems_and_requests_their_messages() {
     }
     assert_eq!(asked, [(2, 32.0, 20_000.0), (2, 31.0, 20_000.0)]);
     // A system that is not configured.
-    let heartbeat = packet(9, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()));
+    let heartbeat = packet(9, &beat(MavType::MAV_TYPE_QUADROTOR));
     let mut s = stream("objects.ant=1", &["ant", "bee"]);
     s.handle_packet(at(1), &heartbeat);
     let warning = s.next_warning().unwrap();
     assert!(warning.contains("object '9' streams, but '1', 'bee' was asked for"), "{warning}");
     s.handle_packet(at(1), b"hello");
     assert!(s.next_warning().unwrap().contains("5 bytes contain no MAVLink packet"));
+}
+
+fn beat(mavtype: MavType) -> MavMessage {
+    let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
+    MavMessage::HEARTBEAT(HEARTBEAT_DATA { mavtype, autopilot, ..HEARTBEAT_DATA::default() })
+}
+
+#[test]
+fn ignores_poses_of_other_vehicles() {
+    let mut s = stream("", &["v"]);
+    let from = "10.0.0.9:14550".parse().unwrap();
+    s.handle_packet_from(at(0), from, &packet(3, &beat(MavType::MAV_TYPE_GROUND_ROVER)));
+    let warning = s.next_warning().unwrap();
+    assert!(warning.contains("system 3 is a rover, not a multirotor"), "{warning}");
+    s.handle_packet_from(at(1), from, &quaternion(3, 1, DQuat::IDENTITY, 0.0));
+    assert_eq!(s.handle_packet_from(at(2), from, &position(3, 2, DVec3::X)), []);
+    assert_eq!((s.poll_transmit(at(3)), s.next_warning()), (None, None));
+    s.handle_packet(at(4), &packet(1, &beat(MavType::MAV_TYPE_HEXAROTOR)));
+    s.handle_packet(at(5), &quaternion(1, 4, DQuat::IDENTITY, 0.0));
+    assert_eq!(s.handle_packet(at(6), &position(1, 5, DVec3::X)).len(), 1);
 }
 
 #[test]
