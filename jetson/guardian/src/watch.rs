@@ -156,6 +156,12 @@ impl Watch {
             if wanted.system.is_some_and(|wanted| wanted != system) {
                 return;
             }
+            let mut is_genuine = |bytes: &[u8]| match (&mut *verifier, &wanted.signing) {
+                (Some(verifier), Some(signing)) => {
+                    verifier.check(signing.start.plus_us(elapsed_us), bytes).is_ok()
+                }
+                _ => true,
+            };
             is_heard |= *autopilot == Some((system, packet.header.component_id));
             match &packet.message {
                 MavMessage::HEARTBEAT(heartbeat) => {
@@ -163,9 +169,7 @@ impl Watch {
                     if !matches!(sender, HeartbeatSender::Multirotor { .. }) {
                         return;
                     }
-                    if let (Some(verifier), Some(signing)) = (&mut *verifier, &wanted.signing)
-                        && verifier.check(signing.start.plus_us(elapsed_us), bytes).is_err()
-                    {
+                    if !is_genuine(bytes) {
                         return;
                     }
                     let flight =
@@ -174,7 +178,8 @@ impl Watch {
                 }
                 MavMessage::COMMAND_ACK(ack) => {
                     accepted |= ack.command == MavCmd::MAV_CMD_NAV_LAND
-                        && ack.result == MavResult::MAV_RESULT_ACCEPTED;
+                        && ack.result == MavResult::MAV_RESULT_ACCEPTED
+                        && is_genuine(bytes);
                 }
                 _ => {}
             }

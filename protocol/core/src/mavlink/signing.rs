@@ -79,9 +79,6 @@ pub enum SigningFault {
     /// The stamp is not newer than that of an earlier packet, or it is more than a minute old.
     #[error("a packet is a replay")]
     Replayed,
-    /// There are more senders than the table can store.
-    #[error("more than 16 senders of signed packets")]
-    TooMany,
 }
 
 /// Signs the packets of one sender.
@@ -125,15 +122,20 @@ impl Signer {
 }
 
 /// Verifies received packets.
+///
+/// A new verifier knows no stamps: until the first packet of a sender, it also accepts a recording of that sender that is
+/// at most a minute old, as MAVLink specifies.
 #[derive(Clone, Debug)]
 pub struct Verifier {
     key: SigningKey,
     newest: u64,
     /// Newest stamp for each (system, component, link).
     senders: Vec<([u8; 3], u64), SENDERS>,
+    /// Newest stamp of all evicted senders: an unknown sender must exceed it, because it may be one of them.
+    evicted: u64,
 }
 
-/// Maximum number of senders. A vehicle's link has two or three.
+/// Maximum number of senders stored. A vehicle's link has two or three.
 const SENDERS: usize = 16;
 /// Maximum age of the first packet from a sender. [10 us]
 const MINUTE: u64 = 6_000_000;
@@ -141,7 +143,7 @@ const MINUTE: u64 = 6_000_000;
 impl Verifier {
     /// Returns a verifier without known senders.
     pub const fn new(key: SigningKey) -> Self {
-        Self { key, newest: 0, senders: Vec::new() }
+        Self { key, newest: 0, senders: Vec::new(), evicted: 0 }
     }
 
     /// Verifies a complete packet with a valid checksum. Stores its stamp if it is accepted.
@@ -166,13 +168,22 @@ impl Verifier {
         match self.senders.iter_mut().find(|(known, _)| *known == sender) {
             Some((_, last)) if stamp <= *last => return Err(SigningFault::Replayed),
             Some((_, last)) => *last = stamp,
-            None if stamp + MINUTE < self.newest => return Err(SigningFault::Replayed),
-            None => {
-                self.senders.push((sender, stamp)).map_err(|_| SigningFault::TooMany)?;
+            None if stamp + MINUTE < self.newest || stamp <= self.evicted => {
+                return Err(SigningFault::Replayed);
             }
+            None => self.add(sender, stamp),
         }
         self.newest = self.newest.max(stamp);
         Ok(())
+    }
+
+    /// Adds a sender. If the table is full, it replaces the one with the oldest stamp.
+    fn add(&mut self, sender: [u8; 3], stamp: u64) {
+        let Err(new) = self.senders.push((sender, stamp)) else { return };
+        if let Some(oldest) = self.senders.iter_mut().min_by_key(|(_, last)| *last) {
+            self.evicted = self.evicted.max(oldest.1);
+            *oldest = new;
+        }
     }
 }
 
@@ -286,16 +297,86 @@ mod tests {
     }
 
     #[test]
-    fn tracks_senders_up_to_a_limit() {
+    fn a_full_table_accepts_new_senders_and_no_replays() {
         let mut verifier = Verifier::new(key());
-        for system in 1..=17 {
-            let (packet, len) = signed(&mut Signer::new(key(), 0), NOW, system);
-            let expected = if system <= 16 { Ok(()) } else { Err(SigningFault::TooMany) };
-            assert_eq!(verifier.check(NOW, &packet[..len]), expected);
+        let mut recorded = std::vec::Vec::new();
+        let mut autopilot = Signer::new(key(), 0);
+        let mut now = NOW;
+        for system in 2..=200 {
+            now = now.plus_us(100_000);
+            for (packet, len) in
+                [signed(&mut autopilot, now, 1), signed(&mut Signer::new(key(), 0), now, system)]
+            {
+                assert_eq!(verifier.check(now, &packet[..len]), Ok(()), "system {system}");
+                recorded.push((packet, len));
+            }
         }
+        // All of the recording is less than a minute old, and most of its senders were evicted.
+        for (packet, len) in &recorded {
+            assert_eq!(verifier.check(now, &packet[..*len]), Err(SigningFault::Replayed));
+        }
+        let (packet, len) = signed(&mut Signer::new(key(), 0), now.plus_us(10), 2);
+        assert_eq!(verifier.check(now, &packet[..len]), Ok(()), "an evicted sender returns");
+    }
+
+    #[test]
+    fn strangers_take_no_place_in_the_table() {
+        let mut verifier = Verifier::new(key());
+        let mut stranger = Signer::new(SigningKey::new([7; 32]), 0);
+        for system in 2..=255 {
+            let (packet, len) = signed(&mut stranger, NOW, system);
+            assert_eq!(verifier.check(NOW, &packet[..len]), Err(SigningFault::Forged));
+        }
+        assert!(verifier.senders.is_empty());
+    }
+
+    /// A recording of the last two minutes, replayed to a running receiver and to one that has just started.
+    #[test]
+    fn rejects_a_recording_after_a_restart() {
+        let (mut signer, mut running) = (Signer::new(key(), 0), Verifier::new(key()));
+        let mut recorded = std::vec::Vec::new();
+        for second in 0..120 {
+            let at = NOW.plus_us(second * 1_000_000);
+            let (packet, len) = signed(&mut signer, at, 1);
+            assert_eq!(running.check(at, &packet[..len]), Ok(()));
+            recorded.push((packet, len));
+        }
+        let now = NOW.plus_us(120_000_000);
+        let accepted = |verifier: &mut Verifier| {
+            let check = |(packet, len): &&([u8; MAX_PACKET], usize)| {
+                verifier.check(now, &packet[..*len]).is_ok()
+            };
+            recorded.iter().filter(check).count()
+        };
+        assert_eq!(accepted(&mut running), 0);
+        // MAVLink's rule: at most the last minute, and only before the first packet of the true sender.
+        assert_eq!(accepted(&mut Verifier::new(key())), 60);
+        let mut fresh = Verifier::new(key());
+        let (packet, len) = signed(&mut signer, now, 1);
+        assert_eq!(fresh.check(now, &packet[..len]), Ok(()));
+        assert_eq!(accepted(&mut fresh), 0);
     }
 
     proptest! {
+        /// No packet is accepted twice, in whatever order packets of many senders arrive.
+        #[test]
+        fn accepts_no_packet_twice(order in prop::collection::vec((1u32..40, 0u64..90_000_000), 1..300)) {
+            let mut verifier = Verifier::new(key());
+            let mut recorded = std::vec::Vec::new();
+            for &(system, at_us) in &order {
+                let (packet, len) = signed(&mut Signer::new(key(), 0), NOW.plus_us(at_us), system);
+                let is_old = recorded.contains(&(packet, len));
+                let verdict = verifier.check(NOW, &packet[..len]);
+                prop_assert!(!(is_old && verdict.is_ok()));
+                if verdict.is_ok() {
+                    recorded.push((packet, len));
+                }
+                for (packet, len) in &recorded {
+                    prop_assert_eq!(verifier.check(NOW, &packet[..*len]), Err(SigningFault::Replayed));
+                }
+            }
+        }
+
         #[test]
         fn rejects_any_bytes_without_a_panic(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
             prop_assert!(Verifier::new(key()).check(NOW, &bytes).is_err());

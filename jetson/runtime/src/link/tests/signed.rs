@@ -58,6 +58,31 @@ fn accepts_only_signed_packets_with_new_stamps() {
     assert!(faults.iter().any(|text| text.contains("a replay")), "{faults:?}");
 }
 
+/// A recorded flight of two minutes, replayed to a runtime that has restarted.
+#[test]
+fn a_restarted_runtime_refuses_an_old_recording() {
+    let (now, mut signer) = (HostTime::from_ns(5_000_000_000), Signer::new(key(), 0));
+    let at = |second: u64| START.plus_us(second * 1_000_000);
+    let recorded: Vec<_> = (0..120).map(|second| beat(Some(&mut signer), at(second))).collect();
+    let restarted = || {
+        let signing = Some(LinkSigning { key: key(), start: at(120), accepts_unsigned: false });
+        Link::with(now, LinkSettings { signing, ..LinkSettings::default() })
+    };
+    let replay = |link: &mut Link, packets: &[Vec<u8>]| {
+        let before = link.refused().0;
+        packets.iter().for_each(|packet| link.handle_input(now, packet));
+        packets.len() as u64 - (link.refused().0 - before)
+    };
+    let mut link = restarted();
+    assert_eq!(replay(&mut link, &recorded[..60]), 0);
+    assert!(!link.is_connected());
+    // The last minute passes only before the first packet of the true autopilot.
+    assert_eq!(replay(&mut restarted(), &recorded), 60);
+    link.handle_input(now, &beat(Some(&mut signer), at(120)));
+    assert!(link.is_connected());
+    assert_eq!(replay(&mut link, &recorded), 0);
+}
+
 #[test]
 fn reports_refused_packets_at_growing_intervals() {
     let mut now = HostTime::from_ns(5_000_000_000);
