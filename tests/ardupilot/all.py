@@ -38,6 +38,11 @@ def arguments():
     for name in given.only.split(","):
         if name not in CHECKS:
             parser.error(f"there is no check '{name}'; there are {', '.join(CHECKS)}")
+    if given.keep:
+        try:
+            given.keep.mkdir(parents=True, exist_ok=True)
+        except OSError as why:
+            parser.error(f"--keep: {given.keep} cannot be made: {why.strerror}")
     # PX4 is not flown, so this project's programs are not needed.
     for file in (given.binary, *([] if "px4" in given.binary.name else [given.vizflyt, given.plugin])):
         if not file.is_file():

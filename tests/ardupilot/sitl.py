@@ -2,6 +2,7 @@
 transmitter and its telemetry ports."""
 
 import contextlib
+import json
 import pathlib
 import shutil
 import socket
@@ -31,6 +32,10 @@ CALIBRATED = {f"INS_ACC{n}{what}_{axis}": value
 # The pilot's switch, by PWM; the airframe file leaves three of its positions free.
 SWITCH = {"FLTMODE2": 5, "FLTMODE3": 17, "FLTMODE5": 6}
 PWM = {"STABILIZE": 1100, "LOITER": 1295, "BRAKE": 1425, "ALT_HOLD": 1555, "RTL": 1685, "LAND": 1900}
+
+# Battery of the simulated frame: ArduCopter 4.8 refuses to arm below the airframe's BATT_ARM_VOLT, and takes the
+# voltage at rest from here. [V]
+FRAME = {"maxVoltage": 16.8}
 
 PLACE = "42.3,-71.8,100"
 BOOT_S = 60
@@ -119,6 +124,7 @@ class Running:
         self.folder.mkdir()
         if sitl.eeprom.exists():
             shutil.copy(sitl.eeprom, self.folder)
+        (self.folder / "frame.json").write_text(json.dumps(FRAME))
         self.log = open(self.folder / "log", "w")
         self.slave = poses and subprocess.Popen(
             [sys.executable, HERE / "slave.py", poses.address, "%g,%g,%g" % spawn], stdin=subprocess.PIPE)
@@ -126,7 +132,7 @@ class Running:
         self.transmitter = Transmitter(radio)
         # TELEM2 is the Jetson's, TELEM1 a ground station's. SERIAL0 waits for a client unless it is configured.
         arguments = [
-            "--model", "x", "--speedup", "1", "--home", f"{PLACE},{90 - yaw_deg:g}",
+            "--model", "x:frame.json", "--speedup", "1", "--home", f"{PLACE},{90 - yaw_deg:g}",
             "--defaults", sitl.folder / "calibrated.param", "--rc-in-port", str(radio),
             "--serial0", "udpclient:127.0.0.1:%d" % free_port(),
             "--serial1", f"udpclient:{station.address}", "--serial2", jetson,
