@@ -10,6 +10,8 @@ use std::collections::VecDeque;
 
 use vizflyt_protocol::time::ServerTime;
 
+use super::slew::Slew;
+
 /// Maps frame numbers to the server's clock.
 #[derive(Debug, Default)]
 pub struct FrameClock {
@@ -18,6 +20,7 @@ pub struct FrameClock {
     /// Time since which all frames have been late.
     late_since: Option<ServerTime>,
     last: Option<ServerTime>,
+    slew: Slew,
     /// Slope of the last window that was long enough. [s]
     period_s: Option<f64>,
     /// Scratch memory for the slope.
@@ -34,6 +37,7 @@ impl FrameClock {
         });
         if jumped {
             self.restart();
+            self.slew = Slew::default();
         }
         self.window.push_back((frame, arrival));
         if self.window.len() > WINDOW {
@@ -47,9 +51,12 @@ impl FrameClock {
         if self.late_since.is_some_and(|since| arrival.seconds_since(since) > SLIP_LASTS_S) {
             self.restart();
             self.window.push_back((frame, arrival));
-            return self.monotone(arrival, arrival);
+            self.slew.slip(lateness_s);
+            let stamp = self.slew.apply(arrival);
+            return self.monotone(stamp, arrival);
         }
-        self.monotone(arrival.plus_seconds(-lateness_s), arrival)
+        let stamp = self.slew.apply(arrival.plus_seconds(-lateness_s));
+        self.monotone(stamp, arrival)
     }
 
     fn restart(&mut self) {
@@ -189,6 +196,26 @@ mod tests {
         for frame in 300..350 {
             let stamp = clock.stamp(frame, read);
             assert!(stamp.seconds_since(truth(frame)).abs() < 2e-3, "frame {frame}: {stamp:?}");
+        }
+    }
+
+    /// After a pause of the source, no interval of the stamps is shorter than the true one, and none is much longer.
+    #[test]
+    fn a_pause_of_the_source_does_not_step_the_stamps() {
+        for pause_ms in [20, 50, 100, 200, 400] {
+            let mut clock = FrameClock::default();
+            for frame in 0..300 {
+                clock.stamp(frame, truth(frame));
+            }
+            let late = |frame| truth(frame).plus_ns(pause_ms * 1_000_000);
+            let mut last = clock.stamp(300, late(300));
+            for frame in 301..800 {
+                let stamp = clock.stamp(frame, late(frame));
+                let periods = stamp.seconds_since(last) / (PERIOD_NS as f64 * 1e-9);
+                assert!((0.98..1.4).contains(&periods), "{pause_ms} ms, {frame}: {periods}");
+                last = stamp;
+            }
+            assert!(last.seconds_since(late(799)).abs() < 1e-3, "{pause_ms} ms: {last:?}");
         }
     }
 

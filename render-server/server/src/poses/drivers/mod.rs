@@ -17,6 +17,7 @@ pub mod mavlink;
 mod multi_source;
 pub mod natnet;
 pub mod sender_clock;
+mod slew;
 mod source;
 pub mod udp;
 mod vehicle_names;

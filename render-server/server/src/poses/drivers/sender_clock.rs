@@ -6,6 +6,8 @@
 
 use vizflyt_protocol::time::ServerTime;
 
+use super::slew::Slew;
+
 /// Maps a sender's clock to the server's clock.
 #[derive(Clone, Debug)]
 pub struct SenderClock {
@@ -17,12 +19,20 @@ pub struct SenderClock {
     /// intervals.
     fallen: Option<(u64, ServerTime, u32)>,
     last: Option<ServerTime>,
+    slew: Slew,
     jump_s: Option<f64>,
 }
 
 impl Default for SenderClock {
     fn default() -> Self {
-        Self { buckets: [None; BUCKETS], late_since: None, fallen: None, last: None, jump_s: None }
+        Self {
+            buckets: [None; BUCKETS],
+            late_since: None,
+            fallen: None,
+            last: None,
+            slew: Slew::default(),
+            jump_s: None,
+        }
     }
 }
 
@@ -43,6 +53,7 @@ impl SenderClock {
                 self.late_since.is_some_and(|since| arrival.seconds_since(since) > SLIP_LASTS_S);
             let restarted = self.has_restarted(sent_ns, arrival, late_s);
             if slipped || restarted || late_s < -SLIP_S {
+                self.slew.slip(if restarted { f64::INFINITY } else { late_s });
                 // The jump of the clock equals the apparent earliness of its packets.
                 self.jump_s = Some(-late_s);
                 self.buckets = [None; BUCKETS];
@@ -55,7 +66,8 @@ impl SenderClock {
             _ => *bucket = Some((second, offset_ns)),
         }
         let least_ns = self.least_ns(second).unwrap_or(offset_ns);
-        ServerTime::from_ns(sent_ns.wrapping_add_signed(least_ns)).min(arrival)
+        let stamp = ServerTime::from_ns(sent_ns.wrapping_add_signed(least_ns)).min(arrival);
+        self.slew.apply(stamp)
     }
 
     /// Maps like [`Self::map`], but never returns an earlier time than before.
@@ -201,6 +213,27 @@ mod tests {
             }
         }
         assert_eq!(clock.take_jump_s(), None);
+    }
+
+    /// As [`super::super::frame_clock`]: a pause of the sender's clock never makes the vehicle seem faster.
+    #[test]
+    fn a_pause_of_the_sender_does_not_step_the_stamps() {
+        for pause_ms in [30, 50, 100, 200, 400] {
+            let mut clock = SenderClock::default();
+            let sent = |index| truth(index).as_ns() - APART_NS;
+            for index in 0..200 {
+                clock.map(sent(index), truth(index));
+            }
+            let late = |index| truth(index).plus_ns(pause_ms * 1_000_000);
+            let mut last = clock.map(sent(200), late(200));
+            for index in 201..500 {
+                let stamp = clock.map(sent(index), late(index));
+                let periods = stamp.seconds_since(last) / 0.01;
+                assert!((0.98..1.4).contains(&periods), "{pause_ms} ms, {index}: {periods}");
+                last = stamp;
+            }
+            assert!(last.seconds_since(late(499)).abs() < 1e-3, "{pause_ms} ms: {last:?}");
+        }
     }
 
     #[test]

@@ -6,6 +6,7 @@ mod bridge;
 mod guardian;
 mod loss;
 mod misdeed;
+mod pause;
 mod plugin;
 mod rig;
 mod runtime;
@@ -47,6 +48,17 @@ fn vehicle_holds_or_lands_for_any_plugin_fault() {
         (goal.position_m.x, goal.radius_m) = (2.3, 0.01);
     });
     let complaints = twice(&misdeed::CASES, |case| misdeed::fly(&place, case));
+    let complaints: Vec<_> = complaints.into_iter().flatten().collect();
+    assert!(complaints.is_empty(), "{complaints:#?}");
+}
+
+#[test]
+fn no_pause_of_a_process_lands_the_vehicle_or_makes_it_look_fast() {
+    let place = place(|arena| {
+        arena.goal.as_mut().expect("the room has a goal").radius_m = 0.01;
+    });
+    let params = vizflyt_e2e::airframe_parameters();
+    let complaints = twice(&pause::runs(), |run| pause::fly(&place, &params, *run));
     let complaints: Vec<_> = complaints.into_iter().flatten().collect();
     assert!(complaints.is_empty(), "{complaints:#?}");
 }

@@ -32,6 +32,8 @@ use super::wire::Wire;
 pub(crate) const OBJECT: &str = "vehicle";
 /// Start of the clocks, far enough from zero for earlier times. [ns]
 const START_NS: u64 = 10_000_000_000;
+/// Maximum delay that the simulator's process catches up after a pause, as in its driver. [s]
+const CAUGHT_UP_S: f64 = 0.1;
 const TICK_NS: i64 = (1_000_000_000 / TICK_HZ).cast_signed();
 /// Timeout of a connection whose other end has died. [s]
 const CONNECTION_LOST_S: f64 = 5.0;
@@ -129,6 +131,9 @@ pub(crate) struct Seen {
     pub(crate) orders: Vec<(f64, u8)>,
     /// Number of the guardian's poses that reached the autopilot.
     pub(crate) guardian_poses: u32,
+    /// Maximum speed of the vehicle, and maximum speed in the server's poses. [m/s]
+    pub(crate) fastest_mps: f64,
+    pub(crate) fastest_pose_mps: f64,
     /// Hash of all motion, of all packets to the autopilot, and of every event.
     hash: u64,
 }
@@ -189,10 +194,24 @@ pub(crate) struct Plan<'a> {
     pub(crate) settings: Settings<'a>,
 }
 
+/// Process that may be paused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Process {
+    Simulator,
+    Server,
+    Bridge,
+    Guardian,
+    Runtime,
+    /// All of them: the whole machine stalls.
+    All,
+}
+
 /// A running flight.
 pub(crate) struct Rig {
     now: HostTime,
     tick_at: HostTime,
+    /// Process that is not scheduled, and the end of its pause.
+    paused: Option<(Process, HostTime)>,
     simulation: Simulation,
     pub(crate) wires: Wires,
     server: Option<Server>,
@@ -218,6 +237,7 @@ impl Rig {
         Self {
             now,
             tick_at: now.plus_ns(TICK_NS),
+            paused: None,
             simulation: Simulation::new(config).expect("the autopilot has these parameters"),
             wires: Wires::new(seed),
             server: Some(Server::new(now, &place.arena, Arc::clone(&place.obstacles))),
@@ -274,6 +294,15 @@ impl Rig {
         let lines: Vec<_> =
             events.map(|(at, event)| format!("{:8.3} {}", Self::at_s(*at), event.text)).collect();
         lines.join("\n")
+    }
+
+    /// Pauses a process: it does nothing, and its input waits.
+    pub(crate) fn pause(&mut self, process: Process, seconds: f64) {
+        self.paused = Some((process, self.now.plus_seconds(seconds)));
+    }
+
+    fn is_paused(&self, process: Process) -> bool {
+        self.paused.is_some_and(|(paused, _)| paused == process || paused == Process::All)
     }
 
     // ---- losses ----
@@ -338,36 +367,52 @@ impl Rig {
 
     /// Advances to the next time at which a part has work, and does that work.
     pub(crate) fn step(&mut self) {
-        let Self { wires, now, .. } = self;
+        let (wires, now) = (&self.wires, self.now);
         let into_vehicle =
             if self.has_bridge { wires.uart_to_vehicle.due() } else { wires.to_vehicle.due() };
+        let vehicle = into_vehicle.map_or(self.tick_at, |at| at.min(self.tick_at));
         let dues = [
-            Some(self.tick_at),
-            into_vehicle,
-            self.server.as_ref().and_then(|server| server.due(wires)),
-            self.bridge.as_ref().and_then(|bridge| bridge.due(*now, wires)),
-            self.guardian.as_ref().and_then(|guardian| guardian.due(wires)),
-            self.runtime.as_ref().and_then(|runtime| runtime.due(wires)),
+            (Process::Simulator, Some(vehicle)),
+            (Process::Server, self.server.as_ref().and_then(|server| server.due(wires))),
+            (Process::Bridge, self.bridge.as_ref().and_then(|bridge| bridge.due(now, wires))),
+            (Process::Guardian, self.guardian.as_ref().and_then(|guardian| guardian.due(wires))),
+            (Process::Runtime, self.runtime.as_ref().and_then(|runtime| runtime.due(wires))),
         ];
-        let due = dues.into_iter().flatten().min().expect("the vehicle ticks");
+        let dues = dues.into_iter().filter(|(process, _)| !self.is_paused(*process));
+        let resumes = self.paused.map(|(_, at)| at);
+        let due = dues.filter_map(|(_, due)| due).chain(resumes).min().expect("the vehicle ticks");
         self.now = due.max(now.plus_ns(LEAST_STEP_NS));
         self.turn();
     }
 
     fn turn(&mut self) {
         let now = self.now;
-        if now >= self.tick_at {
+        if self.paused.is_some_and(|(_, until)| now >= until) {
+            // The simulator's process gives up all but this much of its pause.
+            self.tick_at = self.tick_at.max(now.plus_seconds(-CAUGHT_UP_S));
+            self.paused = None;
+        }
+        if now >= self.tick_at && !self.is_paused(Process::Simulator) {
             self.tick_vehicle();
         }
+        let paused = [Process::Server, Process::Bridge, Process::Guardian, Process::Runtime]
+            .map(|p| self.is_paused(p));
+        let [no_server, no_bridge, no_guardian, no_runtime] = paused;
         let wires = &mut self.wires;
-        if let Some(server) = &mut self.server {
-            server.turn(now, wires);
-        } else {
-            wires.capture.clear();
-            wires.imu.clear();
-            wires.reports.clear();
+        match &mut self.server {
+            Some(_) if no_server => {}
+            Some(server) => {
+                server.turn(now, wires);
+                self.seen.fastest_pose_mps = self.seen.fastest_pose_mps.max(server.speed_mps());
+            }
+            None => {
+                wires.capture.clear();
+                wires.imu.clear();
+                wires.reports.clear();
+            }
         }
         match &mut self.bridge {
+            Some(_) if no_bridge => {}
             Some(bridge) => bridge.turn(now, wires),
             None if self.has_bridge => {
                 wires.uart_from_vehicle.clear();
@@ -376,26 +421,34 @@ impl Rig {
             None => {}
         }
         self.guardian = self.guardian.take().filter(|guardian| !guardian.is_over(now));
-        if let Some(guardian) = &mut self.guardian {
-            guardian.turn(now, wires);
-        } else {
-            wires.from_vehicle.clear();
-            wires.to_guardian.clear();
-            wires.feed.clear();
-        }
-        if let Some(runtime) = &mut self.runtime {
-            let known = runtime.events.len();
-            runtime.turn(now, wires);
-            for (_, event) in &runtime.events[known..] {
-                self.seen.hash_bytes(event.text.as_bytes());
+        match &mut self.guardian {
+            Some(_) if no_guardian => {}
+            Some(guardian) => guardian.turn(now, wires),
+            None => {
+                wires.from_vehicle.clear();
+                wires.to_guardian.clear();
+                wires.feed.clear();
             }
-        } else {
-            wires.to_runtime.clear();
-            wires.poses.clear();
-            wires.events.clear();
-            wires.images.clear();
         }
-        self.reach_vehicle();
+        match &mut self.runtime {
+            Some(_) if no_runtime => {}
+            Some(runtime) => {
+                let known = runtime.events.len();
+                runtime.turn(now, wires);
+                for (_, event) in &runtime.events[known..] {
+                    self.seen.hash_bytes(event.text.as_bytes());
+                }
+            }
+            None => {
+                wires.to_runtime.clear();
+                wires.poses.clear();
+                wires.events.clear();
+                wires.images.clear();
+            }
+        }
+        if !self.is_paused(Process::Simulator) {
+            self.reach_vehicle();
+        }
     }
 
     /// Delivers received packets to the vehicle.
@@ -437,6 +490,7 @@ impl Rig {
         }
         let state = *self.simulation.state();
         let (p, v, q) = (state.p_world_m, state.v_world_mps, state.world_from_body);
+        self.seen.fastest_mps = self.seen.fastest_mps.max(v.length());
         for value in p.to_array().into_iter().chain(v.to_array()).chain(q.to_array()) {
             self.seen.hash(value.to_bits());
         }

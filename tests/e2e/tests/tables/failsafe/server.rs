@@ -55,6 +55,11 @@ impl Server {
             .min()
     }
 
+    /// Returns the speed in the newest pose. [m/s]
+    pub(crate) fn speed_mps(&self) -> f64 {
+        self.newest.map_or(0.0, |newest| newest.twist.linear_mps.length())
+    }
+
     fn has_unseen_pose(&self) -> bool {
         self.newest.is_some_and(|newest| newest.stamp > self.rendered)
     }
@@ -68,8 +73,9 @@ impl Server {
             self.referee.handle_event(&event);
         }
         let mut judged_at = None;
-        while let Some(packet) = wires.capture.receive(now) {
-            for measured in self.stream.handle_packet(server(now), &packet) {
+        // The kernel stamps packets when they arrive, also during a pause of the server.
+        while let Some((at, packet)) = wires.capture.receive_stamped(now) {
+            for measured in self.stream.handle_packet(server(at), &packet) {
                 if let Ok(sample) = self.referee.handle_measurement(&measured.with_covariance()) {
                     self.newest = Some(sample);
                     judged_at = Some(sample.stamp);

@@ -47,7 +47,12 @@ impl<T> Wire<T> {
 
     /// Returns the next item that has arrived.
     pub(crate) fn receive(&mut self, now: HostTime) -> Option<T> {
-        self.on_their_way.pop_front_if(|(at, _)| *at <= now).map(|(_, item)| item)
+        self.receive_stamped(now).map(|(_, item)| item)
+    }
+
+    /// Returns the next item that has arrived, and its arrival time.
+    pub(crate) fn receive_stamped(&mut self, now: HostTime) -> Option<(HostTime, T)> {
+        self.on_their_way.pop_front_if(|(at, _)| *at <= now)
     }
 
     /// Returns the arrival time of the next item.
