@@ -140,17 +140,8 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
     let values: Vec<_> = wrong.iter().map(|f| (f.name.clone(), f.right)).collect();
     let mut failed = 0;
     for ((name, right), (_, now)) in values.iter().zip(session.write(&values)?) {
-        match now {
-            Some(now) if same(now, *right) => print_line(format!("written  {name} = {right}")),
-            Some(now) => {
-                failed += 1;
-                print_line(format!("FAILED   {name} is still {now}, not {right}"));
-            }
-            None => {
-                failed += 1;
-                print_line(format!("FAILED   {name}: no reply"));
-            }
-        }
+        failed += usize::from(!now.is_some_and(|now| same(now, *right)));
+        print_line(result_line(name, *right, now));
     }
     if let Some(arena) = &arena {
         failed += usize::from(!upload_fence(&mut session, arena)?);
@@ -224,7 +215,7 @@ fn finding(firmware: &str, count: usize, found: &[Difference]) -> Finding {
     let dangers: Vec<_> = found.iter().filter(|f| f.danger.is_some()).collect();
     let others =
         found.iter().filter(|f| f.danger.is_none() && f.has.is_some() && !f.is_tuned).count();
-    let name = |f: &&Difference| match f.has.map(|has| has as f32) {
+    let name = |f: &&Difference| match f.has.map(shown) {
         Some(has) => format!("{} is {has}", f.name),
         None => f.name.clone(),
     };
@@ -286,10 +277,30 @@ fn status(wrong: usize) -> ExitCode {
     if wrong == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
+/// Returns a parameter's value for printing: integers exactly, others with the six digits that MAVLink's floats carry
+/// through a conversion of units. 0.135, not 0.13500000536441803.
+fn shown(value: f64) -> f64 {
+    let exact = value as f32;
+    if exact.fract() == 0.0 {
+        return f64::from(exact);
+    }
+    format!("{exact:.5e}").parse().unwrap_or(value)
+}
+
+/// Returns the result of writing a parameter; `now` is the value of the autopilot after that.
+fn result_line(name: &str, right: f64, now: Option<f64>) -> String {
+    let wanted = shown(right);
+    match now {
+        Some(now) if same(now, right) => format!("written  {name} = {wanted}"),
+        Some(now) => format!("FAILED   {name} is still {}, not {wanted}", shown(now)),
+        None => format!("FAILED   {name}: no reply"),
+    }
+}
+
 fn line(difference: &Difference) -> String {
     let Difference { name, has, right, danger, is_tuned } = difference;
-    // Printed with the precision of MAVLink: 0.135, not 0.13500000536441803.
-    match (has.map(|has| has as f32), danger) {
+    let right = shown(*right);
+    match (has.map(shown), danger) {
         (Some(has), _) if *is_tuned => {
             format!("tuned    {name} is {has}, and stays; tuning begins at {right}")
         }
@@ -304,6 +315,37 @@ fn line(difference: &Difference) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// The sum of 0.35 and 3.3 has the digits of its rounding.
+    #[test]
+    fn prints_no_digits_of_rounding() {
+        let noisy = [0.35 + 3.3, f64::from(0.135_f32), 0.1 + 0.2, f64::from(2.4_f32) * 3.0];
+        for (value, expected) in noisy.into_iter().zip(["3.65", "0.135", "0.3", "7.2"]) {
+            for (danger, is_tuned) in [(None, false), (Some("far".to_owned()), false), (None, true)]
+            {
+                for has in [None, Some(value)] {
+                    let name = "FENCE_ALT_MAX".to_owned();
+                    let danger = danger.clone().filter(|_| has.is_some());
+                    let difference = Difference { name, has, right: value, danger, is_tuned };
+                    let lines = [
+                        line(&difference),
+                        result_line("FENCE_ALT_MAX", value, has),
+                        result_line("FENCE_ALT_MAX", value, Some(value)),
+                        result_line("FENCE_ALT_MAX", 1.0, has),
+                        finding("ArduCopter 4.6", 1, std::slice::from_ref(&difference)).evidence,
+                    ];
+                    for text in lines {
+                        let words = text.split([' ', ',', ':', ';', ')', '(']);
+                        assert!(words.clone().all(|word| word.len() < 14), "{text}");
+                        assert!(
+                            !text.contains(&value.to_string()) || value.to_string() == expected
+                        );
+                    }
+                }
+            }
+            assert_eq!(shown(value).to_string(), expected);
+        }
+    }
 
     #[test]
     fn evidence_names_dangers_and_the_fence() {
