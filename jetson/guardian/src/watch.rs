@@ -165,7 +165,7 @@ impl Watch {
             is_heard |= *autopilot == Some((system, packet.header.component_id));
             match &packet.message {
                 MavMessage::HEARTBEAT(heartbeat) => {
-                    let sender = sender_of(&packet.header, heartbeat);
+                    let sender = sender_of(packet.header, heartbeat);
                     if !matches!(sender, HeartbeatSender::Multirotor { .. }) {
                         return;
                     }

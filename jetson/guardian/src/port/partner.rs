@@ -238,7 +238,7 @@ impl Partner {
         };
         stream.decoder.push_whole(bytes, |bytes, packet| {
             let MavMessage::HEARTBEAT(heartbeat) = &packet.message else { return };
-            let sender = sender_of(&packet.header, heartbeat);
+            let sender = sender_of(packet.header, heartbeat);
             if found.is_ok() || sender == HeartbeatSender::Device {
                 return;
             }
@@ -297,7 +297,7 @@ impl Partner {
 }
 
 /// Returns the sender of a heartbeat.
-pub(crate) fn sender_of(header: &MavHeader, heartbeat: &HEARTBEAT_DATA) -> HeartbeatSender {
+pub(crate) fn sender_of(header: MavHeader, heartbeat: &HEARTBEAT_DATA) -> HeartbeatSender {
     heartbeat_sender(header.component_id, heartbeat.mavtype as u8, heartbeat.autopilot as u8)
 }
 

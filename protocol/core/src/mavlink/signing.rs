@@ -123,7 +123,7 @@ impl Signer {
 
 /// Verifies received packets.
 ///
-/// A new verifier knows no stamps: until the first packet of a sender, it also accepts a recording of that sender that is
+/// A new verifier has no stamps: until the first packet of a sender, it also accepts a recording of that sender that is
 /// at most a minute old, as MAVLink specifies.
 #[derive(Clone, Debug)]
 pub struct Verifier {

@@ -70,7 +70,9 @@ fn a_restarted_runtime_refuses_an_old_recording() {
     };
     let replay = |link: &mut Link, packets: &[Vec<u8>]| {
         let before = link.refused().0;
-        packets.iter().for_each(|packet| link.handle_input(now, packet));
+        for packet in packets {
+            link.handle_input(now, packet);
+        }
         packets.len() as u64 - (link.refused().0 - before)
     };
     let mut link = restarted();
