@@ -1,16 +1,20 @@
 //! Messages between runtime and guardian over a `SOCK_SEQPACKET` socket: one byte for the kind, then the body. Most
 //! messages are whole MAVLink packets.
 
-use std::io;
-use std::net::SocketAddr;
-use std::os::fd::{AsRawFd, BorrowedFd};
+#![allow(unsafe_code, reason = "owns the descriptors that the kernel passes")]
 
-use nix::sys::socket::{MsgFlags, recv, send};
+use std::io::{self, IoSlice, IoSliceMut};
+use std::net::SocketAddr;
+use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
+
+use nix::sys::socket::{
+    ControlMessage, ControlMessageOwned, MsgFlags, recv, recvmsg, send, sendmsg,
+};
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::mavlink::{SigningKey, SigningTime};
 use vizflyt_protocol::packet::feed::FeedKey;
 
-use crate::port::{LinkSigning, Wanted};
+use crate::port::{LinkSigning, OpenPort, Wanted};
 
 /// Maximum message size, larger than any datagram of MAVLink packets on Ethernet. [bytes]
 pub(crate) const MAX_MESSAGE: usize = 2049;
@@ -31,12 +35,17 @@ pub(crate) enum MessageKind {
     Refused = b'X',
     /// From the guardian: a note for the user.
     Note = b'N',
+    /// From the guardian: it runs; see [`crate::pulse`].
+    Alive = b'A',
+    /// From the guardian: its open port, for the case that it fails ([`OpenPort`]).
+    Port = b'P',
 }
 
 impl MessageKind {
     fn of(byte: u8) -> Option<Self> {
         [Self::Mavlink, Self::Setup, Self::Feed, Self::Ready, Self::Refused, Self::Note]
             .into_iter()
+            .chain([Self::Alive, Self::Port])
             .find(|kind| *kind as u8 == byte)
     }
 }
@@ -104,6 +113,22 @@ pub(crate) fn put_body(
     put(socket, kind, body)
 }
 
+/// Sends the open port without blocking.
+///
+/// # Errors
+/// See [`put`].
+pub(crate) fn put_port(socket: BorrowedFd<'_>, port: &OpenPort) -> io::Result<()> {
+    let mut bytes = [0; 64];
+    let body = postcard::to_slice(&port.partner, &mut bytes).map_err(io::Error::other)?;
+    let numbers: Vec<RawFd> = port.descriptors.iter().map(AsRawFd::as_raw_fd).collect();
+    let parts = [IoSlice::new(&[MessageKind::Port as u8]), IoSlice::new(body)];
+    let rights = [ControlMessage::ScmRights(&numbers)];
+    let rights = if numbers.is_empty() { &rights[..0] } else { &rights[..] };
+    let flags = MsgFlags::MSG_DONTWAIT | MsgFlags::MSG_NOSIGNAL;
+    sendmsg::<()>(socket.as_raw_fd(), &parts, rights, flags, None)?;
+    Ok(())
+}
+
 /// Result of [`take`].
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Received<'a> {
@@ -117,12 +142,51 @@ pub(crate) enum Received<'a> {
 /// Waits for a message, at most for the socket's timeout.
 pub(crate) fn take<'a>(socket: BorrowedFd<'_>, buffer: &'a mut [u8; MAX_MESSAGE]) -> Received<'a> {
     match recv(socket.as_raw_fd(), &mut buffer[..], MsgFlags::empty()) {
-        Ok(0) => Received::Ended,
-        Ok(len) => match MessageKind::of(buffer[0]) {
-            Some(kind) => Received::Message(kind, &buffer[1..len]),
+        Ok(len) => message(&buffer[..len]),
+        Err(error) => failed(error),
+    }
+}
+
+/// As [`take`], with the descriptors of the message.
+pub(crate) fn take_with_descriptors<'a>(
+    socket: BorrowedFd<'_>,
+    buffer: &'a mut [u8; MAX_MESSAGE],
+) -> (Received<'a>, Vec<OwnedFd>) {
+    let mut control = nix::cmsg_space!([RawFd; 2]);
+    let mut descriptors = Vec::new();
+    let len = {
+        let mut parts = [IoSliceMut::new(buffer)];
+        let flags = MsgFlags::MSG_CMSG_CLOEXEC;
+        match recvmsg::<()>(socket.as_raw_fd(), &mut parts, Some(&mut control), flags) {
+            Ok(received) => {
+                for message in received.cmsgs().into_iter().flatten() {
+                    if let ControlMessageOwned::ScmRights(numbers) = message {
+                        // SAFETY: the kernel has just opened them for this process, and no other code has their numbers.
+                        let own = |number| unsafe { OwnedFd::from_raw_fd(number) };
+                        descriptors.extend(numbers.into_iter().map(own));
+                    }
+                }
+                received.bytes
+            }
+            Err(error) => return (failed(error), descriptors),
+        }
+    };
+    (message(&buffer[..len]), descriptors)
+}
+
+fn message(bytes: &[u8]) -> Received<'_> {
+    match bytes.split_first() {
+        None => Received::Ended,
+        Some((&kind, body)) => match MessageKind::of(kind) {
+            Some(kind) => Received::Message(kind, body),
             None => Received::Nothing,
         },
-        Err(nix::Error::EAGAIN | nix::Error::EINTR) => Received::Nothing,
-        Err(_) => Received::Ended,
+    }
+}
+
+fn failed<'a>(error: nix::Error) -> Received<'a> {
+    match error {
+        nix::Error::EAGAIN | nix::Error::EINTR => Received::Nothing,
+        _ => Received::Ended,
     }
 }

@@ -8,6 +8,9 @@
 //!         ◀────────────────────────────────────────── port ◀──
 //! server ── sealed datagrams ── feed ────────▶ watch (if the runtime sends no poses)
 //! ```
+//! The guardian hands its open port to the runtime. If it ends, or does not report for 0.3 s ([`pulse`]), the runtime
+//! kills it and lands the vehicle over this port. Nothing else is sent that way.
+//!
 //! Four threads (one only prints), one lock, no allocation after the start (tested), no async. [`watch`] decides, sans-IO, by the same
 //! rules as the bridge on the vehicle ([`vizflyt_protocol::failsafe`]). [`port`] carries bytes. [`client`] is the
 //! runtime's end. Signals and keys that end the runtime do not reach the guardian.
@@ -16,6 +19,7 @@ mod channel;
 pub mod client;
 mod feed;
 pub mod port;
+pub mod pulse;
 pub mod watch;
 
 use std::io::{self, Write};
@@ -37,9 +41,10 @@ use vizflyt_protocol::time::HostTime;
 pub use channel::Feed;
 pub use client::{Guardian, Message, SUBCOMMAND};
 
-use channel::{MAX_MESSAGE, MessageKind, Received, Setup, put, take};
+use channel::{MAX_MESSAGE, MessageKind, Received, Setup, put, put_port, take};
 use feed::Subscription;
 use port::{MavlinkAddress, Port};
+use pulse::ALIVE_EVERY_S;
 use watch::{Out, Watch};
 
 /// Maximum wait for a message of the runtime: maximum delay of LAND. [ms]
@@ -122,6 +127,7 @@ fn try_run(address: &str) -> io::Result<()> {
 fn hear_runtime(shared: &Shared) {
     let mut buffer = [0; MAX_MESSAGE];
     let mut has_ended = false;
+    let mut alive_at = HostTime::ZERO;
     loop {
         let received = if has_ended {
             thread::sleep(Duration::from_millis(TICK_MS.unsigned_abs()));
@@ -147,6 +153,10 @@ fn hear_runtime(shared: &Shared) {
             }
         }
         watch.handle_timeout(now, &mut shared.out());
+        if now >= alive_at {
+            alive_at = now.plus_seconds(ALIVE_EVERY_S);
+            let _ = put(shared.runtime.as_fd(), MessageKind::Alive, &[]);
+        }
         if watch.is_over(now) {
             shared.is_over.store(true, Ordering::Relaxed);
             return;
@@ -157,7 +167,13 @@ fn hear_runtime(shared: &Shared) {
 /// Receives the autopilot's bytes, and forwards them to the runtime unchanged before decoding them.
 fn hear_autopilot(shared: &Shared) {
     let mut buffer = [0; MAX_MESSAGE - 1];
+    let mut shared_at = None;
     while !shared.is_over.load(Ordering::Relaxed) {
+        let changes = Some(shared.port.changes());
+        if shared_at != changes {
+            let sent = shared.port.share().and_then(|port| put_port(shared.runtime.as_fd(), &port));
+            shared_at = changes.filter(|_| sent.is_ok());
+        }
         if let Some(intruder) = shared.port.poll_intruder() {
             let _ = put(shared.runtime.as_fd(), MessageKind::Note, intruder.to_string().as_bytes());
         }

@@ -293,24 +293,25 @@ impl Watch {
     }
 }
 
-const HEARTBEAT: u32 = 0;
+pub(crate) const HEARTBEAT: u32 = 0;
+pub(crate) const COMMAND_LONG: u32 = 76;
 const SET_POSITION_TARGET_LOCAL_NED: u32 = 84;
 
 /// Whether a message makes the autopilot act: a setpoint, a mode or a command.
 const fn is_order(id: u32) -> bool {
-    // SET_MODE, COMMAND_INT, COMMAND_LONG.
-    (is_stream(id) && !is_navigation(id)) || matches!(id, 11 | 75 | 76)
+    // SET_MODE, COMMAND_INT.
+    (is_stream(id) && !is_navigation(id)) || matches!(id, 11 | 75 | COMMAND_LONG)
 }
 
 /// Header and payload of a MAVLink 2 packet.
-struct Head<'a> {
+pub(crate) struct Head<'a> {
     source: (u8, u8),
-    id: u32,
-    payload: &'a [u8],
+    pub(crate) id: u32,
+    pub(crate) payload: &'a [u8],
 }
 
 impl<'a> Head<'a> {
-    fn of(packet: &'a [u8]) -> Option<Self> {
+    pub(crate) fn of(packet: &'a [u8]) -> Option<Self> {
         let &[0xFD, len, _, _, _, system, component, a, b, c, ref rest @ ..] = packet else {
             return None;
         };

@@ -177,10 +177,15 @@ fn receive_mavlink(
                     tracing::warn!("mavlink: {text}");
                     let _ = sender.try_send(ControlInput::Note(text));
                 }
+                Ok(Some(Message::Failed(failure))) => {
+                    tracing::error!("{failure}: lands without it");
+                    let _ = sender.send(ControlInput::GuardianFailed);
+                }
                 Ok(None) => {}
                 Err(error) => {
                     tracing::error!("{error}");
                     let _ = sender.try_send(ControlInput::Note(error.to_string()));
+                    let _ = sender.send(ControlInput::GuardianFailed);
                 }
             }
         }

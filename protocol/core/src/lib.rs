@@ -42,4 +42,4 @@ pub use copter_mode::CopterMode;
 ///
 /// Raise it with any change that an older peer would misread. Peers compare it first ([`packet::Preamble`]), and reject
 /// a mismatch with a message that names both versions.
-pub const PROTOCOL_VERSION: u16 = 13;
+pub const PROTOCOL_VERSION: u16 = 14;

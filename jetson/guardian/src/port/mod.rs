@@ -3,7 +3,8 @@
 
 use std::fmt;
 use std::io;
-use std::net::{SocketAddr, ToSocketAddrs};
+use std::net::{SocketAddr, TcpListener, TcpStream, ToSocketAddrs, UdpSocket};
+use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::{Mutex, PoisonError};
@@ -127,6 +128,15 @@ impl fmt::Display for MavlinkAddress {
 #[derive(Debug)]
 pub struct Port(Transport);
 
+/// Open descriptors of a port, for a second process. Both then share its local address and its connection.
+#[derive(Debug)]
+pub(crate) struct OpenPort {
+    /// UDP: address of the autopilot, if it is known.
+    pub(crate) partner: Option<SocketAddr>,
+    /// Socket or device; for `tcpin`, the listener and then the connection, if there is one.
+    pub(crate) descriptors: Vec<OwnedFd>,
+}
+
 #[derive(Debug)]
 enum Transport {
     Udp(UdpPort, Box<Mutex<Partner>>),
@@ -160,6 +170,71 @@ impl Port {
                 Transport::Serial(SerialPort::open(path, *baud, *flow)?)
             }
         }))
+    }
+
+    /// Returns a port at `address` over the descriptors of another one.
+    ///
+    /// # Errors
+    /// Returns an error if a descriptor is missing or invalid.
+    pub(crate) fn adopt(
+        address: &MavlinkAddress,
+        wanted: Wanted,
+        made_at: Instant,
+        open: OpenPort,
+    ) -> io::Result<Self> {
+        let mut descriptors = open.descriptors.into_iter();
+        let mut next = || descriptors.next().ok_or(io::ErrorKind::NotConnected);
+        Ok(Self(match address {
+            MavlinkAddress::UdpIn(_) | MavlinkAddress::UdpOut(_) => {
+                let partner = if let MavlinkAddress::UdpOut(to) = address {
+                    Partner::fixed(*to, made_at)
+                } else {
+                    Partner::known(open.partner, wanted, made_at)
+                };
+                let udp = UdpPort::adopt(UdpSocket::from(next()?));
+                Transport::Udp(udp, Box::new(Mutex::new(partner)))
+            }
+            MavlinkAddress::TcpIn(_) => {
+                let listener = TcpListener::from(next()?);
+                Transport::Tcp(TcpPort::adopt_listening(listener, next().ok().map(TcpStream::from)))
+            }
+            MavlinkAddress::TcpOut(to) => {
+                Transport::Tcp(TcpPort::adopt(*to, next().ok().map(TcpStream::from)))
+            }
+            MavlinkAddress::Serial { path, baud, flow } => Transport::Serial(SerialPort::adopt(
+                path,
+                *baud,
+                *flow,
+                next().ok().map(std::fs::File::from),
+            )?),
+        }))
+    }
+
+    /// Returns the descriptors of this port.
+    ///
+    /// # Errors
+    /// Returns an error if this process has too many open files.
+    pub(crate) fn share(&self) -> io::Result<OpenPort> {
+        let (partner, descriptors) = match &self.0 {
+            Transport::Udp(udp, partner) => {
+                let partner = partner.lock().unwrap_or_else(PoisonError::into_inner).address();
+                (partner, vec![udp.share()?])
+            }
+            Transport::Tcp(tcp) => (None, tcp.share()?),
+            Transport::Serial(serial) => (None, serial.share()?),
+        };
+        Ok(OpenPort { partner, descriptors })
+    }
+
+    /// Returns the number of changes of the descriptors or of the partner.
+    pub(crate) fn changes(&self) -> u32 {
+        match &self.0 {
+            Transport::Udp(_, partner) => {
+                partner.lock().unwrap_or_else(PoisonError::into_inner).changes()
+            }
+            Transport::Tcp(tcp) => tcp.changes(),
+            Transport::Serial(serial) => serial.changes(),
+        }
     }
 
     /// Returns the local end of the link: the socket's address, or the device.
@@ -290,6 +365,43 @@ mod tests {
         here.send(b"pong");
         autopilot.set_read_timeout(Some(std::time::Duration::from_mins(1))).unwrap();
         assert_eq!(autopilot.recv(&mut buffer).unwrap(), 4);
+    }
+
+    /// A second port over the descriptors of the first continues after the first is gone.
+    #[test]
+    fn adopted_port_keeps_address_and_partner() {
+        let adopt = |first: Port, address: &str| {
+            let address = address.parse().unwrap();
+            let open = first.share().unwrap();
+            drop(first);
+            Port::adopt(&address, Wanted::default(), Instant::now(), open).unwrap()
+        };
+        let mut buffer = [0; 64];
+        for kind in ["udp", "tcp"] {
+            let address = format!("{kind}in:127.0.0.1:0");
+            let here = open(&address);
+            let out = format!("{kind}out:{}", here.local().unwrap());
+            let there = open(&out);
+            check(&here, &there);
+            assert_ne!(here.changes(), 0, "the partner, or the connection");
+            let (local, there) = (here.local().unwrap(), adopt(there, &out));
+            let here = adopt(here, &address);
+            assert_eq!(here.local().unwrap(), local);
+            // No connection is made and no heartbeat is needed.
+            for (from, to) in [(&here, &there), (&there, &here)] {
+                from.send(b"pong");
+                let received = std::iter::repeat_with(|| to.receive(&mut buffer).unwrap());
+                assert_eq!(received.take(100).flatten().next(), Some(4), "{kind}");
+            }
+        }
+        let pty = nix::pty::openpty(None, None).unwrap();
+        let address =
+            format!("serial:{}:3000000", nix::unistd::ttyname(&pty.slave).unwrap().display());
+        let here = adopt(open(&address), &address);
+        here.send(b"pong");
+        assert_eq!(nix::unistd::read(&pty.master, &mut buffer).unwrap(), 4);
+        let second = Port::open(&address.parse().unwrap(), Wanted::default());
+        assert_eq!(second.unwrap_err().kind(), io::ErrorKind::AddrInUse, "the device is locked");
     }
 
     #[test]

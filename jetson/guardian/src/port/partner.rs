@@ -111,6 +111,8 @@ pub(super) struct Partner {
     current: Option<(SocketAddr, Instant)>,
     /// System id of the partner.
     system: u8,
+    /// Number of changes of the address.
+    changes: u32,
     /// Decoders per sender, newest last. A sender may cut packets anywhere, as a bridge of a serial line does.
     streams: Vec<Stream>,
     intruders: Vec<Remembered>,
@@ -151,9 +153,16 @@ impl Partner {
             made_at: now,
             current: None,
             system: 0,
+            changes: 0,
             streams: Vec::new(),
             intruders: Vec::new(),
         }
+    }
+
+    /// As [`Self::waited_for`], for a partner that another process has found since `made_at`.
+    pub(super) fn known(found: Option<SocketAddr>, wanted: Wanted, made_at: Instant) -> Self {
+        let current = found.map(|address| (address, Instant::now()));
+        Self { current, ..Self::waited_for(wanted, made_at) }
     }
 
     /// Returns a partner with a fixed address; other senders are ignored.
@@ -193,6 +202,7 @@ impl Partner {
             }
             (_, Ok(system)) => {
                 (self.current, self.system) = (Some((from, now)), system);
+                self.changes = self.changes.wrapping_add(1);
                 true
             }
             // Not the partner, so nothing is sent to it, but the link reports what it is.
@@ -207,6 +217,11 @@ impl Partner {
     /// Returns the address to send to.
     pub(super) fn address(&self) -> Option<SocketAddr> {
         self.current.map(|(address, _)| address)
+    }
+
+    /// Returns the number of changes of the address.
+    pub(super) fn changes(&self) -> u32 {
+        self.changes
     }
 
     /// Returns an intruder that is due to be reported at `now`: the first datagram at once, later ones at growing

@@ -3,9 +3,10 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
-use std::os::fd::AsFd;
+use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
@@ -30,6 +31,7 @@ pub(super) struct SerialPort {
     /// Locked: if two programs read, each would get only some of the bytes.
     file: Mutex<Option<Arc<Flock<File>>>>,
     backlog: Mutex<Vec<u8>>,
+    changes: AtomicU32,
 }
 
 /// Returns the system's constant for a baud rate; `None` if it is not supported.
@@ -55,15 +57,42 @@ pub(super) fn speed(baud: u32) -> Option<BaudRate> {
 
 impl SerialPort {
     pub(super) fn open(path: &Path, baud: u32, flow: bool) -> io::Result<Self> {
-        let baud = speed(baud).ok_or(ErrorKind::InvalidInput)?;
-        let file = open(path, baud, flow)?;
-        Ok(Self {
+        let speed = speed(baud).ok_or(ErrorKind::InvalidInput)?;
+        Ok(Self::new(path, speed, flow, Some(open(path, speed, flow)?)))
+    }
+
+    /// Returns a port over the device that another one has opened; without a `file`, the device is opened again.
+    pub(super) fn adopt(
+        path: &Path,
+        baud: u32,
+        flow: bool,
+        file: Option<File>,
+    ) -> io::Result<Self> {
+        let speed = speed(baud).ok_or(ErrorKind::InvalidInput)?;
+        // Both descriptors share one lock.
+        let file = file.map(lock).transpose()?;
+        Ok(Self::new(path, speed, flow, file))
+    }
+
+    fn new(path: &Path, baud: BaudRate, flow: bool, file: Option<Flock<File>>) -> Self {
+        Self {
             path: path.to_owned(),
             baud,
             flow,
-            file: Mutex::new(Some(Arc::new(file))),
+            file: Mutex::new(file.map(Arc::new)),
             backlog: Mutex::default(),
-        })
+            changes: AtomicU32::new(0),
+        }
+    }
+
+    /// Returns the device, if it is open.
+    pub(super) fn share(&self) -> io::Result<Vec<OwnedFd>> {
+        let clone = |file: Arc<Flock<File>>| Ok(file.try_clone()?.into());
+        self.current().map(clone).into_iter().collect()
+    }
+
+    pub(super) fn changes(&self) -> u32 {
+        self.changes.load(Ordering::Relaxed)
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -76,6 +105,7 @@ impl SerialPort {
 
     fn set(&self, file: Option<Arc<Flock<File>>>) {
         *self.file.lock().unwrap_or_else(PoisonError::into_inner) = file;
+        self.changes.fetch_add(1, Ordering::Relaxed);
     }
 
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Option<usize> {
@@ -125,8 +155,7 @@ impl SerialPort {
 fn open(path: &Path, baud: BaudRate, flow: bool) -> io::Result<Flock<File>> {
     let file =
         OpenOptions::new().read(true).write(true).custom_flags(O_NOCTTY | O_NONBLOCK).open(path)?;
-    let file = Flock::lock(file, FlockArg::LockExclusiveNonblock)
-        .map_err(|(_, _)| io::Error::from(ErrorKind::AddrInUse))?;
+    let file = lock(file)?;
     let mut settings = tcgetattr(&*file)?;
     cfmakeraw(&mut settings);
     settings.control_flags |= ControlFlags::CLOCAL | ControlFlags::CREAD;
@@ -135,4 +164,8 @@ fn open(path: &Path, baud: BaudRate, flow: bool) -> io::Result<Flock<File>> {
     tcsetattr(&*file, SetArg::TCSANOW, &settings)?;
     tcflush(&*file, FlushArg::TCIOFLUSH)?;
     Ok(file)
+}
+
+fn lock(file: File) -> io::Result<Flock<File>> {
+    Flock::lock(file, FlockArg::LockExclusiveNonblock).map_err(|_| ErrorKind::AddrInUse.into())
 }

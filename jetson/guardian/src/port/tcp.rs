@@ -3,6 +3,8 @@
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::os::fd::OwnedFd;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
@@ -19,6 +21,7 @@ const CONNECT_WAIT: Duration = Duration::from_millis(500);
 pub(super) struct TcpPort {
     peer: Peer,
     stream: Mutex<Option<Arc<TcpStream>>>,
+    changes: AtomicU32,
 }
 
 #[derive(Debug)]
@@ -31,11 +34,41 @@ impl TcpPort {
     pub(super) fn listen(local: SocketAddr) -> io::Result<Self> {
         let listener = TcpListener::bind(local)?;
         listener.set_nonblocking(true)?;
-        Ok(Self { peer: Peer::Waits(listener), stream: Mutex::default() })
+        Ok(Self::adopt_listening(listener, None))
     }
 
     pub(super) fn connect(to: SocketAddr) -> Self {
-        Self { peer: Peer::Calls(to), stream: Mutex::default() }
+        Self::adopt(to, None)
+    }
+
+    /// Returns a port over the listener and the connection of another one.
+    pub(super) fn adopt_listening(listener: TcpListener, stream: Option<TcpStream>) -> Self {
+        Self::new(Peer::Waits(listener), stream)
+    }
+
+    /// Returns a port over the connection of another one to `to`.
+    pub(super) fn adopt(to: SocketAddr, stream: Option<TcpStream>) -> Self {
+        Self::new(Peer::Calls(to), stream)
+    }
+
+    fn new(peer: Peer, stream: Option<TcpStream>) -> Self {
+        Self { peer, stream: Mutex::new(stream.map(Arc::new)), changes: AtomicU32::new(0) }
+    }
+
+    /// Returns the listener, if there is one, and the connection, if there is one.
+    pub(super) fn share(&self) -> io::Result<Vec<OwnedFd>> {
+        let mut shared = Vec::new();
+        if let Peer::Waits(listener) = &self.peer {
+            shared.push(listener.try_clone()?.into());
+        }
+        if let Some(stream) = self.current() {
+            shared.push(stream.try_clone()?.into());
+        }
+        Ok(shared)
+    }
+
+    pub(super) fn changes(&self) -> u32 {
+        self.changes.load(Ordering::Relaxed)
     }
 
     pub(super) fn local(&self) -> io::Result<String> {
@@ -51,6 +84,7 @@ impl TcpPort {
 
     fn set(&self, stream: Option<Arc<TcpStream>>) {
         *self.stream.lock().unwrap_or_else(PoisonError::into_inner) = stream;
+        self.changes.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Opens a connection, within [`CONNECT_WAIT`].

@@ -2,6 +2,7 @@
 
 use std::io;
 use std::net::{SocketAddr, UdpSocket};
+use std::os::fd::OwnedFd;
 use std::time::Duration;
 
 use socket2::{Domain, Protocol, Socket, Type};
@@ -23,6 +24,15 @@ impl UdpPort {
         // So that a receiving thread notices the end of the flight.
         socket.set_read_timeout(Some(Duration::from_millis(100)))?;
         Ok(Self { socket })
+    }
+
+    /// Returns a port over the socket of another one.
+    pub(super) fn adopt(socket: UdpSocket) -> Self {
+        Self { socket }
+    }
+
+    pub(super) fn share(&self) -> io::Result<OwnedFd> {
+        Ok(self.socket.try_clone()?.into())
     }
 
     pub(super) fn local_addr(&self) -> io::Result<SocketAddr> {

@@ -125,6 +125,12 @@ impl Companion {
         }
     }
 
+    /// Ends the flight because the guardian has failed: LAND must not wait for the next setpoint.
+    pub fn guardian_failed(&mut self, now: HostTime) {
+        self.flight.guardian_failed(now);
+        self.steering.hurry();
+    }
+
     /// Uploads the arena's fence to the autopilot, if the arena is known; reports boxes that polygons cannot express.
     pub fn upload_fence(&mut self, now: HostTime) {
         let Some(arena) = &self.arena else { return };

@@ -63,6 +63,8 @@ pub enum ControlInput {
     FromPlugin(Box<FromPlugin>),
     /// Event of a plugin process; processes are numbered from 0.
     Plugin(u32, PluginEvent),
+    /// The guardian has failed.
+    GuardianFailed,
     /// Message of a driver for people.
     Note(String),
     /// Request to restart the plugin; the vehicle holds until it is back.
@@ -245,6 +247,7 @@ impl ControlLoop {
             ControlInput::Plugin(run, PluginEvent::Exited(sentence)) => {
                 self.plugin_exited(now, run, sentence);
             }
+            ControlInput::GuardianFailed => self.companion.guardian_failed(now),
             ControlInput::Note(text) => self.companion.note(now, &text),
             ControlInput::Reload => self.replace_plugin(now, "reloading the plugin".to_owned()),
             ControlInput::Interrupt => self.companion.interrupt(now),

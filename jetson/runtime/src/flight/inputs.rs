@@ -74,6 +74,12 @@ impl Flight {
         self.end_for(now, EndReason::Interrupted);
     }
 
+    /// Ends the flight because the guardian has failed.
+    pub fn guardian_failed(&mut self, now: HostTime) {
+        self.has_guardian = false;
+        self.end_for(now, EndReason::GuardianFailed);
+    }
+
     /// Handles an event of the link to the autopilot.
     pub fn handle_link(&mut self, now: HostTime, event: LinkEvent) {
         match event {

@@ -142,6 +142,8 @@ pub struct Flight {
     /// Whether a pilot flies; then nothing more is sent.
     pilot_flies: bool,
     interrupted_at: Option<HostTime>,
+    /// Whether a guardian completes the landing if this runtime ends.
+    has_guardian: bool,
     disarmed_at: Option<HostTime>,
     connected_at: HostTime,
     /// Whether a person must press start before the take-off.
@@ -185,6 +187,7 @@ impl Flight {
             taken: None,
             pilot_flies: false,
             interrupted_at: None,
+            has_guardian: true,
             disarmed_at: None,
             connected_at: now,
             waits_for_start: false,

@@ -192,6 +192,7 @@ impl Flight {
         let in_land = link.mode == CopterMode::Land as u32;
         let released = self
             .interrupted_at
+            .filter(|_| self.has_guardian)
             .is_some_and(|at| (link.connected && in_land) || now.seconds_since(at) > INTERRUPT_S);
         // A pilot who lands has no time limit.
         let landing_s = if self.pilot_flies { 0.0 } else { now.seconds_since(self.phase_at) };

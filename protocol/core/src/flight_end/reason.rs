@@ -102,6 +102,8 @@ pub enum EndReason {
         /// Possible error of the pose: three standard deviations along the worst axis. [m]
         off_m: f64,
     },
+    /// The guardian process ended or hung.
+    GuardianFailed,
 }
 
 /// Contact of the vehicle's body with an obstacle.

@@ -69,6 +69,7 @@ impl fmt::Display for EndReason {
             Self::NeverTookOff => f.write_str("the vehicle never took off"),
             Self::RecordEnds => f.write_str("the record ends before the flight"),
             Self::PoseUnsure { off_m } => write!(f, "the pose could be off by {off_m:.2} m"),
+            Self::GuardianFailed => f.write_str("the guardian process failed"),
             Self::ImagesOld { age_s } => write!(f, "the plugin's images were {age_s:.1} s old"),
         }
     }

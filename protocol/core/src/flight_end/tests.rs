@@ -61,6 +61,7 @@ fn each() -> Vec<EndReason> {
         RecordEnds,
         ImagesOld { age_s: 2.9 },
         PoseUnsure { off_m: 0.27 },
+        GuardianFailed,
     ]
 }
 

@@ -133,16 +133,16 @@ mod tests {
 
     #[test]
     fn names_the_side_to_update() {
-        check(*b"VZFL\x0d\x00\x01\x00", PeerRole::Runtime, Ok(PeerRole::Server));
+        check(*b"VZFL\x0e\x00\x01\x00", PeerRole::Runtime, Ok(PeerRole::Server));
         check(
-            *b"VZFL\x0e\x00\x01\x00",
+            *b"VZFL\x0f\x00\x01\x00",
             PeerRole::Runtime,
-            Err("server speaks protocol 14, this runtime 13: update the runtime"),
+            Err("server speaks protocol 15, this runtime 14: update the runtime"),
         );
         check(
             *b"VZFL\x00\x00\x02\x00",
             PeerRole::Server,
-            Err("runtime speaks protocol 0, this server 13: update the runtime"),
+            Err("runtime speaks protocol 0, this server 14: update the runtime"),
         );
         let stranger = "the other side does not speak VizFlyt; check the address and port";
         check(*b"HTTP/1.1", PeerRole::Server, Err(stranger));

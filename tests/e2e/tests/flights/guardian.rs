@@ -107,6 +107,32 @@ fn survives_signals_and_ends_after_the_landing() {
     }
 }
 
+/// The runtime takes the port of a guardian that has failed: LAND passes, setpoints do not. A stopped guardian is killed.
+#[test]
+fn runtime_sends_land_itself_if_the_guardian_fails() {
+    for signal in [Signal::SIGKILL, Signal::SIGSTOP] {
+        let (guardian, autopilot) = start();
+        kill(Pid::from_raw(guardian.pid().cast_signed()), signal).unwrap();
+        let (mut buffer, deadline) = (BUFFER, Instant::now() + PATIENCE);
+        while !matches!(guardian.receive(&mut buffer).unwrap(), Some(Message::Failed(_))) {
+            assert!(Instant::now() < deadline, "{signal}: the failure is not reported");
+        }
+        while !guardian.has_left() {
+            assert!(Instant::now() < deadline, "{signal}: it still runs");
+        }
+        guardian.send(&setpoint());
+        let land = vizflyt_protocol::failsafe::land((1, 1), 0);
+        guardian.send(&packet((255, 191), &MavMessage::COMMAND_LONG(land)));
+        autopilot.set_read_timeout(Some(PATIENCE)).unwrap();
+        let len = autopilot.recv(&mut buffer).unwrap();
+        assert_eq!(buffer[7..len][0], 76, "{signal}: only LAND passes");
+        autopilot.send(&heartbeat(LAND, true)).unwrap();
+        while !matches!(guardian.receive(&mut buffer).unwrap(), Some(Message::Mavlink(_))) {
+            assert!(Instant::now() < deadline, "{signal}: nothing comes from the autopilot");
+        }
+    }
+}
+
 #[test]
 fn reports_a_port_in_use_and_leaves_no_process() {
     let taken = UdpSocket::bind("127.0.0.1:0").unwrap();

@@ -410,8 +410,18 @@ impl Flight {
         let _ = kill(Pid::from_raw(self.runtime.child.id().cast_signed()), Signal::SIGSTOP);
     }
 
+    /// Sends a signal to the guardian.
+    pub(crate) fn signal_guardian(&self, signal: Signal) {
+        let _ = kill(self.guardian(), signal);
+    }
+
     /// Kills the runtime and its guardian, as if the Jetson were off.
     pub(crate) fn switch_off(&mut self) {
+        self.signal_guardian(Signal::SIGKILL);
+        let _ = self.runtime.child.kill();
+    }
+
+    fn guardian(&self) -> Pid {
         let runtime = self.runtime.child.id();
         let children = format!("/proc/{runtime}/task/{runtime}/children");
         let children = fs::read_to_string(children).expect("the runtime runs");
@@ -420,9 +430,7 @@ impl Flight {
             line.split(|byte| *byte == 0).nth(1) == Some(b"guardian")
         };
         let guardian = children.split_whitespace().find(is_guardian).expect("it has a guardian");
-        let guardian = Pid::from_raw(guardian.parse().expect("a number"));
-        let _ = kill(guardian, Signal::SIGKILL);
-        let _ = self.runtime.child.kill();
+        Pid::from_raw(guardian.parse().expect("a number"))
     }
 
     /// Stops the bridge, as if it hangs.

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use crate::lab::{Flight, Lab, Plan};
 use glam::Vec3;
+use nix::sys::signal::Signal;
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_splat::{format, ply};
 
@@ -17,6 +18,10 @@ enum Loss {
     RuntimeKilled,
     /// The runtime is stopped, as if it hangs: the guardian lands after 0.5 s.
     RuntimeStopped,
+    /// The guardian is killed: the runtime lands at once.
+    GuardianKilled,
+    /// The guardian is stopped, as if it hangs: the runtime kills it and lands after 0.3 s.
+    GuardianStopped,
     /// The server is killed: the runtime lands after 0.5 s.
     ServerKilled,
 }
@@ -40,7 +45,12 @@ fn vehicle_lands_after_the_loss_of_a_process() {
         scope.spawn(|| check_lands(&lab, 1, Loss::RuntimeStopped));
     });
     drop(lab);
-    check_lands(&Mutex::new(open(1)), 0, Loss::ServerKilled);
+    let lab = Mutex::new(open(3));
+    std::thread::scope(|scope| {
+        scope.spawn(|| check_lands(&lab, 0, Loss::GuardianKilled));
+        scope.spawn(|| check_lands(&lab, 1, Loss::GuardianStopped));
+    });
+    check_lands(&lab, 2, Loss::ServerKilled);
 }
 
 /// Opens a lab with an empty room: no collision, and the goal is not reached.
@@ -82,10 +92,16 @@ fn check_lands(lab: &Mutex<Lab>, index: usize, loss: Loss) {
     match loss {
         Loss::RuntimeKilled => flight.kill_runtime(),
         Loss::RuntimeStopped => flight.stop_runtime(),
+        Loss::GuardianKilled => flight.signal_guardian(Signal::SIGKILL),
+        Loss::GuardianStopped => flight.signal_guardian(Signal::SIGSTOP),
         Loss::ServerKilled => lab.lock().expect("no thread panics with the lock").kill_server(),
     }
     wait(loss, "the floor", || flight.now().p_m.z < DOWN_M);
     check_landed(&flight, loss, last_good.at);
+    if matches!(loss, Loss::GuardianKilled | Loss::GuardianStopped) {
+        let report = flight.wait().report;
+        assert_eq!(report["reason"], "the guardian process failed", "{loss:?}: {report}");
+    }
 }
 
 /// Asserts that LAND was entered after the loss, and that the vehicle never left the fence.
@@ -97,7 +113,7 @@ fn check_landed(flight: &Flight, loss: Loss, lost_at: Instant) {
     let outside = track.iter().find(|sight| !(FENCE_X_M.0..FENCE_X_M.1).contains(&sight.p_m.x));
     assert!(outside.is_none(), "{loss:?}: left the fence: {outside:?}");
     let poses = flight.guardian_poses();
-    if !matches!(loss, Loss::ServerKilled) {
+    if matches!(loss, Loss::RuntimeKilled | Loss::RuntimeStopped) {
         assert!(poses > GUARDIAN_POSES, "{loss:?}: {poses} poses by the guardian's own feed");
     }
 }

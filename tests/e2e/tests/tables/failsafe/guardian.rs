@@ -1,6 +1,7 @@
 //! The guardian's process: its core between the runtime's socket and the autopilot's port.
 
 use vizflyt_guardian::port::Wanted;
+use vizflyt_guardian::pulse::ALIVE_EVERY_S;
 use vizflyt_guardian::watch::{Out, Watch};
 use vizflyt_protocol::time::HostTime;
 
@@ -16,6 +17,10 @@ pub(crate) enum ToRuntime {
     Mavlink(Vec<u8>),
     /// A message for people.
     Note(&'static str),
+    /// The guardian runs.
+    Alive,
+    /// The guardian's end of the socket has closed.
+    Closed,
 }
 
 /// A running guardian.
@@ -26,6 +31,9 @@ pub(crate) struct Guardian {
     pub(crate) socket_closes_at: Option<HostTime>,
     /// The autopilot has sent a packet, so its address is known.
     has_partner: bool,
+    alive_at: HostTime,
+    /// The process is stopped, as if it hangs; nothing closes.
+    pub(crate) is_stopped: bool,
 }
 
 impl Guardian {
@@ -35,6 +43,8 @@ impl Guardian {
             tick_at: now,
             socket_closes_at: None,
             has_partner: false,
+            alive_at: now,
+            is_stopped: false,
         }
     }
 
@@ -45,6 +55,9 @@ impl Guardian {
 
     /// Returns the next time at which the guardian has work.
     pub(crate) fn due(&self, wires: &Wires) -> Option<HostTime> {
+        if self.is_stopped {
+            return None;
+        }
         let dues = [
             Some(self.tick_at),
             self.socket_closes_at,
@@ -57,6 +70,9 @@ impl Guardian {
 
     /// Does all work that is due.
     pub(crate) fn turn(&mut self, now: HostTime, wires: &mut Wires) {
+        if self.is_stopped {
+            return;
+        }
         while let Some(bytes) = wires.from_vehicle.receive(now) {
             self.has_partner = true;
             wires.to_runtime.send(now, ToRuntime::Mavlink(bytes.clone()));
@@ -79,6 +95,10 @@ impl Guardian {
             self.tick_at = now.plus_ns(TICK_NS);
             let mut port = Port { now, wires, has_partner: self.has_partner };
             self.watch.handle_timeout(now, &mut port);
+            if now >= self.alive_at {
+                self.alive_at = now.plus_seconds(ALIVE_EVERY_S);
+                wires.to_runtime.send(now, ToRuntime::Alive);
+            }
         }
     }
 }

@@ -19,6 +19,10 @@ enum Loss {
     Runtime,
     /// The runtime is stopped, as if it hangs.
     Stopped,
+    /// The guardian is killed.
+    Guardian,
+    /// The guardian is stopped, as if it hangs, and then continued. [s]
+    GuardianStopped(f64),
     /// The runtime and its guardian are killed.
     Jetson,
     /// MAVLink stops in both directions, as on a loss of Wi-Fi. [s]
@@ -69,7 +73,7 @@ pub(crate) struct Case {
 }
 
 /// Losses at each of [`SPEEDS_MPS`].
-const AT_ALL_SPEEDS: [Case; 11] = [
+const AT_ALL_SPEEDS: [Case; 16] = [
     Case {
         loss: Loss::Runtime,
         name: "the runtime is killed",
@@ -93,6 +97,46 @@ const AT_ALL_SPEEDS: [Case; 11] = [
         bridge: true,
         by: By::Order(GUARDIAN),
         land_within_s: 0.02,
+    },
+    Case {
+        loss: Loss::Guardian,
+        name: "the guardian is killed",
+        does: "runtime: LAND at once",
+        bridge: false,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.02,
+    },
+    Case {
+        loss: Loss::GuardianStopped(FOR_EVER),
+        name: "the guardian is stopped",
+        does: "runtime: LAND after 0.3 s",
+        bridge: false,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.4,
+    },
+    Case {
+        loss: Loss::GuardianStopped(1.0),
+        name: "the guardian is stopped and continued after 1 s",
+        does: "runtime: LAND after 0.3 s",
+        bridge: false,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.4,
+    },
+    Case {
+        loss: Loss::Guardian,
+        name: "the guardian is killed, behind a bridge",
+        does: "runtime: LAND at once",
+        bridge: true,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.02,
+    },
+    Case {
+        loss: Loss::GuardianStopped(FOR_EVER),
+        name: "the guardian is stopped, behind a bridge",
+        does: "runtime: LAND after 0.3 s",
+        bridge: true,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.4,
     },
     Case {
         loss: Loss::Server,
@@ -163,13 +207,21 @@ const AT_ALL_SPEEDS: [Case; 11] = [
 const BY_AUTOPILOT: &str = "autopilot: stops by GUID_TIMEOUT, LAND by FS_GCS_TIMEOUT";
 
 /// Losses at the lowest of [`SPEEDS_MPS`].
-const AT_ONE_SPEED: [Case; 6] = [
+const AT_ONE_SPEED: [Case; 7] = [
     Case {
         loss: Loss::Autopilot,
         name: "the autopilot reboots in flight",
         does: "none possible: motors stop, it falls",
         bridge: false,
         by: By::Gravity,
+        land_within_s: 0.0,
+    },
+    Case {
+        loss: Loss::GuardianStopped(0.2),
+        name: "the guardian is stopped for 200 ms",
+        does: "none: it flies on",
+        bridge: false,
+        by: By::FliesOn,
         land_within_s: 0.0,
     },
     Case {
@@ -297,7 +349,10 @@ pub(crate) fn fly(place: &Place, params: &[(String, f32)], run: Run) -> Row {
 fn strike(rig: &mut Rig, case: &Case) -> f64 {
     let since_s = rig.now_s();
     let lasts_s = match case.loss {
-        Loss::Mavlink(seconds) | Loss::Bridge(seconds) | Loss::Poses(seconds)
+        Loss::Mavlink(seconds)
+        | Loss::Bridge(seconds)
+        | Loss::Poses(seconds)
+        | Loss::GuardianStopped(seconds)
             if seconds < FOR_EVER =>
         {
             seconds
@@ -307,6 +362,8 @@ fn strike(rig: &mut Rig, case: &Case) -> f64 {
     match case.loss {
         Loss::Runtime => rig.kill_runtime(),
         Loss::Stopped => rig.stop_runtime(),
+        Loss::Guardian => rig.kill_guardian(),
+        Loss::GuardianStopped(_) => rig.stop_guardian(true),
         Loss::Jetson => rig.switch_off(),
         Loss::BridgeHangs => rig.hang_bridge(),
         Loss::Server => rig.kill_server(),
@@ -325,6 +382,7 @@ fn strike(rig: &mut Rig, case: &Case) -> f64 {
         match case.loss {
             Loss::Bridge(_) => rig.restart_bridge(),
             Loss::Poses(_) => rig.wires.capture.is_cut = false,
+            Loss::GuardianStopped(_) => rig.stop_guardian(false),
             _ => rig.wires.cut_mavlink(false),
         }
     }

@@ -320,6 +320,19 @@ impl Rig {
         self.runtime.as_mut().expect("it runs").is_stopped = true;
     }
 
+    /// Kills the guardian.
+    pub(crate) fn kill_guardian(&mut self) {
+        self.guardian = None;
+        self.wires.to_runtime.send(self.now, ToRuntime::Closed);
+    }
+
+    /// Stops the guardian, as if it hangs, or continues it.
+    pub(crate) fn stop_guardian(&mut self, is_stopped: bool) {
+        if let Some(guardian) = &mut self.guardian {
+            guardian.is_stopped = is_stopped;
+        }
+    }
+
     /// Switches the vehicle's computer off: runtime and guardian.
     pub(crate) fn switch_off(&mut self) {
         (self.runtime, self.guardian) = (None, None);
@@ -420,12 +433,17 @@ impl Rig {
             }
             None => {}
         }
-        self.guardian = self.guardian.take().filter(|guardian| !guardian.is_over(now));
+        let is_replaced =
+            self.runtime.as_ref().is_some_and(|runtime| runtime.has_replaced_guardian);
+        let runs = |guardian: &Guardian| !is_replaced && !guardian.is_over(now);
+        self.guardian = self.guardian.take().filter(runs);
         match &mut self.guardian {
             Some(_) if no_guardian => {}
             Some(guardian) => guardian.turn(now, wires),
             None => {
-                wires.from_vehicle.clear();
+                if !is_replaced {
+                    wires.from_vehicle.clear();
+                }
                 wires.to_guardian.clear();
                 wires.feed.clear();
             }

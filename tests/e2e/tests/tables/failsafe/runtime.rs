@@ -1,6 +1,7 @@
 //! The runtime's process: the companion, and a model of its driver `control`, which runs on the wall clock.
 
 use vizflyt_arena::ArenaConfig;
+use vizflyt_guardian::pulse::{Pulse, may_bypass};
 use vizflyt_protocol::flight_end::PluginFault;
 use vizflyt_protocol::messages::{Event, FlightPhase, FromPlugin, Limits, OutcomeKind};
 use vizflyt_protocol::time::HostTime;
@@ -13,6 +14,9 @@ use vizflyt_runtime::stream::ServerClock;
 use super::guardian::ToRuntime;
 use super::plugin::{Deed, Output, Plugin};
 use super::rig::{Wires, host};
+
+/// Period of checks of the guardian, as in its client. [ns]
+const CHECK_NS: i64 = 50_000_000;
 
 /// Settings of a flight.
 #[derive(Clone, Copy, Debug)]
@@ -42,6 +46,10 @@ pub(crate) struct Runtime {
     pub(crate) is_stopped: bool,
     /// Time at which the connection to a dead server times out.
     pub(crate) server_lost_at: Option<HostTime>,
+    pulse: Pulse,
+    check_at: HostTime,
+    /// The guardian has failed: the runtime kills it and uses its port.
+    pub(crate) has_replaced_guardian: bool,
 }
 
 impl Runtime {
@@ -70,6 +78,9 @@ impl Runtime {
             is_leaving: false,
             is_stopped: false,
             server_lost_at: None,
+            pulse: Pulse::new(now),
+            check_at: now,
+            has_replaced_guardian: false,
         }
     }
 
@@ -96,6 +107,7 @@ impl Runtime {
             Some(self.companion.poll_timeout()),
             self.plugin.due(),
             self.server_lost_at,
+            if self.has_replaced_guardian { wires.from_vehicle.due() } else { Some(self.check_at) },
         ];
         dues.into_iter().flatten().min()
     }
@@ -109,8 +121,11 @@ impl Runtime {
             match message {
                 ToRuntime::Mavlink(bytes) => self.companion.handle_mavlink(now, &bytes),
                 ToRuntime::Note(text) => self.companion.note(now, text),
+                ToRuntime::Alive => self.pulse.note_alive(now),
+                ToRuntime::Closed => self.replace_guardian(now),
             }
         }
+        self.check_guardian(now, wires);
         self.companion.drain_imu(|_, reading| wires.imu.send(now, reading));
         while let Some(sample) = wires.poses.receive(now) {
             self.companion.handle_pose(now, &sample, host(sample.stamp));
@@ -136,7 +151,11 @@ impl Runtime {
             self.companion.handle_timeout(now);
         }
         while let Some(datagram) = self.companion.poll_transmit() {
-            wires.to_guardian.send(now, datagram.to_vec());
+            if !self.has_replaced_guardian {
+                wires.to_guardian.send(now, datagram.to_vec());
+            } else if may_bypass(&datagram) {
+                wires.to_vehicle.send(now, datagram.to_vec());
+            }
         }
         while self.companion.poll_link_event().is_some() {}
         while let Some(event) = self.companion.poll_event() {
@@ -146,6 +165,25 @@ impl Runtime {
         while let Some(message) = self.companion.poll_plugin() {
             self.plugin.handle_message(now, &message);
         }
+    }
+
+    /// Receives from the autopilot in place of a guardian that has failed, or checks whether it has.
+    fn check_guardian(&mut self, now: HostTime, wires: &mut Wires) {
+        if self.has_replaced_guardian {
+            while let Some(bytes) = wires.from_vehicle.receive(now) {
+                self.companion.handle_mavlink(now, &bytes);
+            }
+        } else if now >= self.check_at {
+            self.check_at = now.plus_ns(CHECK_NS);
+            if self.pulse.has_failed(now) {
+                self.replace_guardian(now);
+            }
+        }
+    }
+
+    fn replace_guardian(&mut self, now: HostTime) {
+        self.has_replaced_guardian = true;
+        self.companion.guardian_failed(now);
     }
 
     fn handle_plugin(&mut self, now: HostTime, output: Output) {
