@@ -1,11 +1,14 @@
-"""Output that is not read: a full pipe at `serve` and `demo` must not delay STOP, the guard or the poses. See `run`."""
+"""Output that cannot be written: a full pipe, a full disk or a stopped terminal must not delay STOP, the guard or the
+poses. See `run`."""
 
 import contextlib
 import json
 import os
 import pathlib
+import socket
 import subprocess
 import tempfile
+import termios
 import time
 import urllib.request
 
@@ -67,38 +70,97 @@ def press(page):
     return time.monotonic() - began
 
 
-def serving(folder):
-    arena = scene(folder)
-    server = Unread("serve", "--json", "--lifeline", "--renderer=cpu", "--quic=127.0.0.1:0", "--http=127.0.0.1:0",
-                    "--vicon=127.0.0.1:0", "--leaderboard=none", "--keys", folder / "keys", arena)
+class Terminal(Unread):
+    """As [`Unread`], at a terminal whose reader stops reading."""
+
+    def __init__(self, *arguments):
+        self.reader, self.writer = os.openpty()
+        self.process = subprocess.Popen([VIZFLYT, *map(str, arguments)], stdin=subprocess.PIPE, stdout=self.writer,
+                                        stderr=self.writer)
+        self.text = ""
+
+    def fill(self):
+        """Stops the terminal, as Ctrl-S does."""
+        termios.tcflow(self.writer, termios.TCOOFF)
+
+
+class FullDisk:
+    """A running `vizflyt` whose standard output and standard error are files on a full disk."""
+
+    def __init__(self, *arguments):
+        with open("/dev/full", "wb") as full:
+            self.process = subprocess.Popen([VIZFLYT, *map(str, arguments)], stdin=subprocess.PIPE, stdout=full,
+                                            stderr=full)
+
+    end = Unread.end
+
+
+def serves(page, within_s=120.0):
+    """Waits until a page answers; returns whether it does."""
+    until = time.monotonic() + within_s
+    while time.monotonic() < until:
+        with contextlib.suppress(OSError), urllib.request.urlopen(page, timeout=10):
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def serving_on_a_full_disk(folder, arena):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = "{}:{}".format(*free.getsockname())
+    page = f"http://{address}"
+    server = FullDisk("serve", "--lifeline", "--renderer=cpu", "--quic=127.0.0.1:0", f"--http={address}",
+                      "--vicon=127.0.0.1:0", "--leaderboard=none", "--keys", folder / "keys", arena)
+    try:
+        check("a server whose output is on a full disk serves", serves(page))
+        took_s = sorted(press(page) for _ in range(PRESSES))
+        print(f"      full disk: at most {took_s[-1] * 1e3:.1f} ms")
+        check("STOP while the disk of the server's output is full", took_s[-1] < STOP_WITHIN_S,
+              f"took {[round(s, 2) for s in took_s]} s")
+    finally:
+        has_ended = server.end()
+    check("a server whose output is on a full disk ends on SIGTERM", has_ended)
+
+
+def serving(folder, arena, kind, how):
+    server = kind("serve", "--json", "--lifeline", "--renderer=cpu", "--quic=127.0.0.1:0", "--http=127.0.0.1:0",
+                  "--vicon=127.0.0.1:0", "--leaderboard=none", "--keys", folder / "keys", arena)
     try:
         page = json.loads(server.read_until('"ready"'))["http"].rstrip("/")
         server.fill()
         took_s = sorted(press(page) for _ in range(PRESSES))
-        check("STOP while the server's output is not read", took_s[-1] < STOP_WITHIN_S,
+        print(f"      {how}: at most {took_s[-1] * 1e3:.1f} ms")
+        check(f"STOP beside {how} of the server", took_s[-1] < STOP_WITHIN_S,
               f"took {[round(s, 2) for s in took_s]} s")
     finally:
         has_ended = server.end()
-    check("a server whose output is not read ends on SIGTERM", has_ended)
+    check(f"a server ends on SIGTERM beside {how}", has_ended)
 
 
-def flying(folder):
+def flying(folder, kind, how):
     report = folder / "report.json"
-    demo = Unread("demo", "--headless", "--max-rate=40", "--seconds=8", "--log=none", "--report", report)
+    report.unlink(missing_ok=True)
+    demo = kind("demo", "--headless", "--max-rate=40", "--seconds=8", "--log=none", "--report", report)
     try:
-        demo.read_until("the plugin flies")
-        demo.fill()
+        if kind is not FullDisk:
+            demo.read_until("the plugin flies")
+            demo.fill()
         demo.process.wait(60)
     except subprocess.TimeoutExpired:
-        check("a flight whose output is not read ends", False)
+        check(f"a flight ends beside {how}", False)
     finally:
         demo.end()
     outcome = json.loads(report.read_text()) if report.exists() else {}
-    check("a flight whose output is not read goes on to its end", outcome.get("outcome") in ("landed", "finished"),
+    check(f"a flight goes on to its end beside {how}", outcome.get("outcome") in ("landed", "finished"),
           f"{outcome.get('outcome')}: {outcome.get('reason')}")
 
 
 with tempfile.TemporaryDirectory() as name:
-    serving(pathlib.Path(name))
-    flying(pathlib.Path(name))
+    place = pathlib.Path(name)
+    course = scene(place)
+    for output, how in ((Unread, "a full pipe"), (Terminal, "a stopped terminal")):
+        serving(place, course, output, how)
+    serving_on_a_full_disk(place, course)
+    for output, how in ((Unread, "a full pipe"), (Terminal, "a stopped terminal"), (FullDisk, "a full disk")):
+        flying(place, output, how)
 end()
