@@ -62,6 +62,10 @@ pub struct Referee {
     course: Course,
     last: Option<(ServerTime, Pose<World, Body>)>,
     took_off: Option<ServerTime>,
+    /// Last phase that the runtime reported.
+    phase: Option<FlightPhase>,
+    /// Whether the newest pose is higher than [`AIRBORNE_M`] above the start.
+    is_up: bool,
     /// The end was reported, or the vehicle has landed: nothing is checked.
     over: bool,
     /// The flight was ended from outside: course and time are not checked.
@@ -86,6 +90,8 @@ impl Referee {
             course: Course::new(config),
             last: None,
             took_off: None,
+            phase: None,
+            is_up: false,
             over: false,
             ended: false,
             near_fence: false,
@@ -114,6 +120,7 @@ impl Referee {
     pub fn restart(&mut self) {
         self.course = Course::new(&self.config);
         self.took_off = None;
+        self.is_up = false;
         self.over = false;
         self.ended = false;
         self.near_fence = false;
@@ -122,6 +129,7 @@ impl Referee {
 
     /// Processes a measurement of the vehicle; returns the pose if it is accepted.
     pub fn handle_measurement(&mut self, measured: &Measured) -> Result<PoseSample, Rejected> {
+        self.filter.set_in_flight(self.is_in_flight());
         let known = self.filter.newest().map(|newest| newest.stamp);
         let sample = self.filter.handle_pose(measured)?;
         self.report_change(sample.stamp);
@@ -145,6 +153,9 @@ impl Referee {
 
     /// Processes an event of the runtime or of a person.
     pub fn handle_event(&mut self, event: &Event) {
+        if let EventKind::Phase(phase) = event.kind {
+            self.phase = Some(phase);
+        }
         match event.kind {
             // Earlier motion by hand was not a flight.
             EventKind::Phase(FlightPhase::TakingOff) => self.restart(),
@@ -209,6 +220,18 @@ impl Referee {
         self.obstacles.still.obstacle_slice(z_m)
     }
 
+    /// Whether the vehicle is in the air. While it takes off or lands, and without a runtime, its height counts.
+    fn is_in_flight(&self) -> bool {
+        use FlightPhase::{
+            Connecting, Flying, Holding, Landed, Landing, Preparing, TakingOff, Waiting,
+        };
+        match self.phase {
+            Some(Flying | Holding) => true,
+            Some(Connecting | Preparing | Waiting | Landed) => false,
+            Some(TakingOff | Landing) | None => self.is_up,
+        }
+    }
+
     fn voxel_m(&self) -> f64 {
         self.obstacles.still.grid().voxel_m
     }
@@ -221,7 +244,8 @@ impl Referee {
         let to = &sample.world_from_body;
         let (from_m, to_m) = (from.translation_m, to.translation_m);
         let risen_m = to_m.z - self.config.spawn.position_m.z;
-        if self.took_off.is_none() && risen_m > AIRBORNE_M {
+        self.is_up = risen_m > AIRBORNE_M;
+        if self.took_off.is_none() && self.is_up {
             self.took_off = Some(sample.stamp);
         }
         if !self.is_judging() {

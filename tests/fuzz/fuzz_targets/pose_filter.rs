@@ -47,14 +47,14 @@ impl Machine {
                 let source = input.byte()?;
                 let late_s = input.number(0.05)?;
                 let turned = quaternion(input.three(3.0)?);
+                let world_from_body = Pose::new(
+                    input.three(3.0)?.into(),
+                    if turned.is_finite() { turned.normalize() } else { turned },
+                );
+                self.filter.set_in_flight(source >= 128);
                 let measured = Measured {
                     source,
-                    stamp: self.now.plus_seconds(-late_s),
                     arrival: self.now,
-                    world_from_body: Pose::new(
-                        input.three(3.0)?.into(),
-                        if turned.is_finite() { turned.normalize() } else { turned },
-                    ),
                     sigma: match source % 2 {
                         0 => None,
                         _ => Some(PoseSigma {
@@ -62,6 +62,7 @@ impl Machine {
                             rotation_rad: input.three(0.01)?.into(),
                         }),
                     },
+                    ..Measured::new(self.now.plus_seconds(-late_s), world_from_body)
                 };
                 self.refused += u64::from(self.filter.handle_pose(&measured).is_err());
             }

@@ -10,7 +10,7 @@ use super::estimate::{Estimate, Manoeuvre};
 use super::history::{History, Input, Record};
 use super::motion::Motion;
 use super::quality::{Fading, PoseQuality, Rejects};
-use super::source::{ClaimKind, Source, Surprise};
+use super::source::{ClaimKind, Comparison, Source, Surprise};
 use super::{ImuReading, MAX_SOURCES, Measured, PoseConfig, PoseSigma, Rejected};
 
 /// Change in the availability of poses.
@@ -36,6 +36,7 @@ pub struct PoseFilter {
     /// Reason for rejecting the last measurement, if it was rejected.
     rejected: Option<Rejected>,
     resets: u8,
+    in_flight: bool,
     lost: bool,
     change: Option<PoseChange>,
     /// Reset that has not been polled yet.
@@ -89,6 +90,7 @@ impl PoseFilter {
             newest: None,
             rejected: None,
             resets: 0,
+            in_flight: false,
             lost: false,
             change: None,
             jumped: None,
@@ -97,12 +99,20 @@ impl PoseFilter {
         }
     }
 
+    /// Sets whether the vehicle is in the air. Sensor noise then makes every measurement differ from the one
+    /// before, so repeated poses are not measurements. On the ground, the poses of a source that rounds may repeat.
+    pub fn set_in_flight(&mut self, in_flight: bool) {
+        self.in_flight = in_flight;
+    }
+
     /// Processes a measurement; returns the newest sample if it is accepted. For a measurement older than that,
-    /// the sample keeps its stamp and is recomputed.
+    /// the sample keeps its stamp and is recomputed. In flight, the sample is unchanged for a pose that repeats the
+    /// one before it, for at most 0.15 s, and for the first pose after a loss.
     pub fn handle_pose(&mut self, measured: &Measured) -> Result<PoseSample, Rejected> {
         let index = usize::from(measured.source).min(MAX_SOURCES - 1);
         match self.take(index, measured) {
-            Ok(sigmas) => {
+            Ok(None) => self.newest.ok_or(Rejected::Invalid),
+            Ok(Some(sigmas)) => {
                 if let Some((_, estimate)) = self.history.newest() {
                     self.sources[index].accept(measured, estimate, self.imu.turned);
                 }
@@ -126,13 +136,37 @@ impl PoseFilter {
         }
     }
 
-    /// Returns the innovation of an accepted measurement in standard deviations.
-    fn take(&mut self, index: usize, measured: &Measured) -> Result<f64, Rejected> {
-        let Measured { stamp, world_from_body: pose, .. } = *measured;
+    /// Returns the innovation of an accepted measurement in standard deviations; `None` if the measurement adds
+    /// nothing.
+    fn take(&mut self, index: usize, measured: &Measured) -> Result<Option<f64>, Rejected> {
+        let pose = &measured.world_from_body;
         if !pose.is_valid() || pose.translation_m.abs().max_element() > FURTHEST_M {
             return Err(Rejected::Invalid);
         }
         self.sources[index].check_stamp(measured)?;
+        if self.in_flight && measured.is_origin {
+            return Err(Rejected::NotVisible);
+        }
+        match self.sources[index].compare(measured) {
+            Comparison::Equal(since_s) if self.in_flight => {
+                let repeated = Rejected::Repeated(since_s);
+                self.rejected = Some(repeated);
+                return if since_s > REPEATS_S { Err(repeated) } else { Ok(None) };
+            }
+            // A source that sends old poses may begin with any of them.
+            Comparison::Different(age_s)
+                if self.in_flight && age_s > REPEATS_S && self.is_lost(measured.stamp) =>
+            {
+                return Ok(None);
+            }
+            Comparison::Equal(_) | Comparison::Different(_) => {}
+        }
+        self.fuse(index, measured).map(Some)
+    }
+
+    /// Fuses a measurement if it fits. Returns its innovation in standard deviations.
+    fn fuse(&mut self, index: usize, measured: &Measured) -> Result<f64, Rejected> {
+        let Measured { stamp, world_from_body: pose, .. } = *measured;
         let sigma = self.sigma(measured);
         let long_ago =
             self.newest.is_none_or(|newest| stamp.seconds_since(newest.stamp) > BEGIN_ANEW_AFTER_S);
@@ -437,6 +471,11 @@ impl PoseFilter {
         Some(newest.stamp.plus_seconds(lost_s).plus_ns(1))
     }
 
+    /// Whether no pose has been accepted for too long at `now`.
+    fn is_lost(&self, now: ServerTime) -> bool {
+        self.lost || self.poll_timeout().is_some_and(|due| now >= due)
+    }
+
     /// Returns the time by which a pose may exceed the configured age before it is lost, for the source with
     /// the smallest allowance. [s]
     fn allowance_s(&self, now: ServerTime) -> f64 {
@@ -540,6 +579,8 @@ impl Imu {
 const FURTHEST_M: f64 = 1e4;
 /// After a longer pause, the filter restarts without the former motion. [s]
 const BEGIN_ANEW_AFTER_S: f64 = 1.0;
+/// Time for which a pose may repeat in flight: two equal poses at 10 Hz. [s]
+const REPEATS_S: f64 = 0.15;
 /// A source accepted within this time has priority over others that disagree. [s]
 const TRUSTED_FOR_S: f64 = 0.15;
 /// Measurements closer together contain no information about speed. [s]

@@ -3,7 +3,7 @@
 //! is available for any instant close by.
 //!
 //! ```text
-//! poses, 30 to 500 Hz, of one or several sources --> stamps, frozen? -> gate -\
+//! poses, 10 to 500 Hz, of one or several sources --> stamps, repeats -> gate --\
 //! the autopilot's IMU, 100 Hz, if there is one --------------------------------> estimate
 //!       each put at its stamp, also in the past (history)                     |
 //!                                          PoseSample for each accepted pose <--+--> Motion
@@ -62,13 +62,35 @@ pub struct Measured {
     pub world_from_body: Pose<World, Body>,
     /// Standard deviations; `None` uses the configured ones.
     pub sigma: Option<PoseSigma>,
+    /// Whether the position is exactly the origin of the source, which many systems send for an object that
+    /// they do not see.
+    pub is_origin: bool,
+    /// Differences up to which two poses of the source are equal.
+    pub resolution: Resolution,
 }
 
 impl Measured {
     /// Returns a measurement of source 0 that arrives without delay.
     pub fn new(stamp: ServerTime, world_from_body: Pose<World, Body>) -> Self {
-        Self { source: 0, stamp, arrival: stamp, world_from_body, sigma: None }
+        Self {
+            source: 0,
+            stamp,
+            arrival: stamp,
+            world_from_body,
+            sigma: None,
+            is_origin: world_from_body.translation_m == DVec3::ZERO,
+            resolution: Resolution::default(),
+        }
     }
+}
+
+/// Differences up to which two poses of a source are equal; 0 compares bit for bit.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Resolution {
+    /// Difference along each axis. [m, world]
+    pub position_m: f64,
+    /// Angle between the attitudes. [rad]
+    pub rotation_rad: f64,
 }
 
 /// Reason for rejecting a measurement.
@@ -114,6 +136,18 @@ pub enum Rejected {
          stream is frozen"
     )]
     Frozen(f64),
+    /// Equal to the poses before it for this time, in flight: not a measurement. [s]
+    #[error(
+        "the poses repeat bit for bit, for {0:.2} s: the object is probably not visible to the \
+         localization system"
+    )]
+    Repeated(f64),
+    /// Exactly the origin of the source, in flight: not a measurement.
+    #[error(
+        "the position is exactly 0, 0, 0, which localization systems send for an object that is \
+         not visible"
+    )]
+    NotVisible,
     /// Contradicts another source that is accepted at the same time.
     #[error(
         "the pose is {distance_m:.2} m and {:.0} degrees from that of source {other}, which is \

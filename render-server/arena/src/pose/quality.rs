@@ -20,7 +20,7 @@ pub struct Rejects {
     pub jump: u64,
     /// Attitude flips: swapped markers.
     pub flip: u64,
-    /// Repeated poses while the vehicle moved.
+    /// Repeated poses in flight or while the vehicle moved, and poses of an object that is not visible.
     pub frozen: u64,
     /// Measurements that contradict an accepted source.
     pub disagree: u64,
@@ -35,7 +35,7 @@ impl Rejects {
             Rejected::Outlier(_) => &mut self.outlier,
             Rejected::Jump { .. } => &mut self.jump,
             Rejected::Flip { .. } => &mut self.flip,
-            Rejected::Frozen(_) => &mut self.frozen,
+            Rejected::Frozen(_) | Rejected::Repeated(_) | Rejected::NotVisible => &mut self.frozen,
             Rejected::Disagree { .. } => &mut self.disagree,
         } += 1;
     }

@@ -67,9 +67,20 @@ struct Still {
     turned: DQuat,
 }
 
+/// Comparison of a measurement with the one before it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Comparison {
+    /// Equal to all measurements for this time. [s]
+    Equal(f64),
+    /// Different, this time after the first occurrence of the pose before; infinite for the first measurement. [s]
+    Different(f64),
+}
+
 #[derive(Clone, Debug, Default)]
 pub(super) struct Source {
     last: Option<(ServerTime, ServerTime)>,
+    /// Newest pose that differs from the one before it, and its stamp.
+    changed: Option<(ServerTime, Pose<World, Body>)>,
     still: Option<Still>,
     claim: Option<Claim>,
     pub accepted_at: Option<ServerTime>,
@@ -187,6 +198,24 @@ impl Source {
         self.last = Some((stamp, arrival));
         self.latency.add(arrival, latency_s);
         Ok(())
+    }
+
+    /// Compares a measurement, accepted or not, with the one before it.
+    pub(super) fn compare(&mut self, measured: &Measured) -> Comparison {
+        let Measured { stamp, world_from_body: pose, resolution, .. } = *measured;
+        let age_s = self.changed.map_or(f64::INFINITY, |(since, _)| stamp.seconds_since(since));
+        let is_equal = self.changed.is_some_and(|(_, last)| {
+            let off_m = (pose.translation_m - last.translation_m).abs().max_element();
+            off_m <= resolution.position_m
+                && (pose.rotation == last.rotation
+                    || angle_rad(last.rotation.conjugate() * pose.rotation)
+                        <= resolution.rotation_rad)
+        });
+        if is_equal {
+            return Comparison::Equal(age_s);
+        }
+        self.changed = Some((stamp, pose));
+        Comparison::Different(age_s)
     }
 
     /// Detects bitwise equal poses while the vehicle moves.

@@ -206,6 +206,118 @@ fn loss_of_poses_names_the_reason() {
     }
 }
 
+/// Part of a stream in flight.
+#[derive(Clone, Copy, Debug)]
+enum Part {
+    /// Measurements with noise.
+    Noisy,
+    /// The last pose, with new stamps.
+    Last,
+    /// An earlier pose, with new stamps.
+    Cached,
+    /// The origin.
+    Origin,
+    Silent,
+}
+
+proptest! {
+    /// In flight, poses that repeat for more than 0.15 s are rejected and never used, at any rate, between noise and
+    /// restarts. Poses with noise are never rejected as repeated.
+    #[test]
+    fn repeated_poses_in_flight_are_missing(
+        hz in 10.0..500.0f64,
+        noise_m in 1e-6..2e-3f64,
+        parts in prop::collection::vec((0u8..5, 0.02..1.5f64), 1..12),
+        seed in any::<u32>(),
+    ) {
+        let mut filter = PoseFilter::default();
+        let mut random = seed;
+        let mut noise = move || {
+            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            f64::from(random) / f64::from(u32::MAX) - 0.5
+        };
+        let mut t = 0.0;
+        let cached = DVec3::new(2.0, -1.0, 1.0);
+        let hover = DVec3::new(1.0, 0.5, 1.0);
+        let mut last = hover;
+        let kinds = [Part::Noisy, Part::Last, Part::Cached, Part::Origin, Part::Silent];
+        let parts = parts.into_iter().map(|(kind, s)| (kinds[usize::from(kind)], s));
+        for (part, lasts_s) in std::iter::once((Part::Noisy, 1.0)).chain(parts) {
+            filter.set_in_flight(true);
+            let (mut since, former) = (None, last);
+            for _ in 0..(lasts_s * hz) as u32 {
+                t += 1.0 / hz;
+                let p = match part {
+                    Part::Noisy => hover + DVec3::new(noise(), noise(), noise()) * noise_m,
+                    Part::Last => former,
+                    Part::Cached => cached,
+                    Part::Origin => DVec3::ZERO,
+                    Part::Silent => continue,
+                };
+                let sigma = PoseSigma { position_m: DVec3::splat(2e-3), rotation_rad: DVec3::splat(0.01) };
+                let sent = filter.handle_pose(&Measured { sigma: Some(sigma), ..measured(t, p) });
+                filter.handle_timeout(at(t));
+                let newest = filter.newest().unwrap();
+                if matches!(part, Part::Noisy) {
+                    let refused = matches!(sent, Err(Rejected::Repeated(_) | Rejected::NotVisible | Rejected::Frozen(_)));
+                    prop_assert!(!refused, "{sent:?} at {t}");
+                } else {
+                    let repeated = since.is_some_and(|since| t - since > 0.151);
+                    prop_assert!(!repeated || sent.is_err(), "{part:?} at {t}");
+                    prop_assert!(newest.stamp <= at(since.unwrap_or(t) + 1e-6), "{part:?} at {t}");
+                    since.get_or_insert(t);
+                }
+                last = p;
+            }
+        }
+    }
+
+    /// Poses of a vehicle at rest on the ground are measurements, with and without noise.
+    #[test]
+    fn still_poses_on_the_ground_are_accepted(hz in 10.0..500.0f64, p in prop::array::uniform3(-2.0..2.0f64), rounded in any::<bool>()) {
+        let mut filter = PoseFilter::default();
+        for i in 0..(3.0 * hz) as u32 {
+            let noise_m = if rounded { 0.0 } else { 1e-4 * f64::from(i % 3) };
+            let t = f64::from(i) / hz;
+            prop_assert!(filter.handle_pose(&measured(t, DVec3::from(p) + noise_m)).is_ok());
+            filter.handle_timeout(at(t));
+            prop_assert_eq!(filter.poll_change(), None);
+        }
+    }
+}
+
+#[test]
+fn repeats_are_compared_within_the_resolution_of_the_source() {
+    for (resolution_m, is_missing) in [(0.0, false), (1e-3, true)] {
+        let mut filter = flying(0.0);
+        filter.set_in_flight(true);
+        let resolution = Resolution { position_m: resolution_m, rotation_rad: 0.0 };
+        let mut last = Err(Rejected::Stale);
+        for i in 1..100 {
+            let p = DVec3::X * 2e-4 * f64::from(i % 3);
+            let t = 1.0 + 0.005 * f64::from(i);
+            last = filter.handle_pose(&Measured { resolution, is_origin: false, ..measured(t, p) });
+        }
+        assert_eq!(matches!(last, Err(Rejected::Repeated(_))), is_missing, "{last:?}");
+    }
+}
+
+/// At 10 Hz, two equal poses are 0.1 s apart: only the third one shows that the object is not seen.
+#[test]
+fn two_equal_poses_at_10_hz_are_not_missing() {
+    let mut filter = PoseFilter::default();
+    filter.set_in_flight(true);
+    for i in 0..30 {
+        filter
+            .handle_pose(&measured(0.1 * f64::from(i), DVec3::new(1.0, 0.0, 1e-4 * f64::from(i))))
+            .unwrap();
+    }
+    let last = DVec3::new(1.0, 0.0, 1e-4 * 29.0);
+    assert!(filter.handle_pose(&measured(3.0, last)).is_ok());
+    let third = filter.handle_pose(&measured(3.1, last));
+    assert!(matches!(third, Err(Rejected::Repeated(s)) if (s - 0.2).abs() < 1e-6), "{third:?}");
+}
+
 /// A late or slow source is not lost; it is lost as long after its next pose was due as a fast source.
 #[test]
 fn allows_for_delay_and_rate_of_a_source() {

@@ -263,13 +263,97 @@ fn pose_jump_through_an_obstacle_is_not_a_collision() {
     let mut events = Vec::new();
     for packet in 1..=40 {
         let stamp = ServerTime::ZERO.plus_seconds(newest_s + 0.005 * f64::from(packet));
-        let beyond = Pose::new(DVec3::new(6.0, 1.0, 1.0), DQuat::IDENTITY);
+        // Poses in the air never repeat.
+        let noise_m = 1e-5 * f64::from(packet % 3);
+        let beyond = Pose::new(DVec3::new(6.0 + noise_m, 1.0, 1.0), DQuat::IDENTITY);
         let _ = referee.handle_measurement(&Measured::new(stamp, beyond));
         events.extend(std::iter::from_fn(|| referee.poll_event()));
     }
     let [Event { kind: EventKind::Note, text, .. }] = &events[..] else { panic!("{events:?}") };
     assert!(text.starts_with("the pose jumped by 3.96 m and 0 degrees and stayed there"), "{text}");
     assert_eq!(referee.newest().unwrap().resets, 1, "the new position is accepted in the end");
+}
+
+/// Returns a referee whose vehicle hovers 1 m above the floor, and the time and position of its last pose.
+/// [s], [m, world]
+fn hovering(hz: f64) -> (Referee, f64, DVec3) {
+    let mut referee = referee(&arena());
+    fly(&mut referee, &[[0., 0., 0.], [0., 0.5, 1.]], 2.0, 1.0);
+    referee.handle_event(&received(EventKind::Phase(FlightPhase::Flying)));
+    let mut t_s = referee.newest().unwrap().stamp.seconds_since(ServerTime::ZERO);
+    let mut p_m = DVec3::ZERO;
+    for index in 0..(2.0 * hz) as u32 {
+        t_s += 1.0 / hz;
+        let noise_m = 1e-5 * f64::from(index % 3);
+        // The stop was hard: its first poses may be outliers.
+        p_m = DVec3::new(noise_m, 0.5, 1.0);
+        let _ = send(&mut referee, t_s, p_m);
+    }
+    while referee.poll_event().is_some() {}
+    (referee, t_s, p_m)
+}
+
+fn send(referee: &mut Referee, t_s: f64, p_m: DVec3) -> Result<PoseSample, Rejected> {
+    let stamp = ServerTime::ZERO.plus_seconds(t_s);
+    let sent = referee.handle_measurement(&Measured::new(stamp, Pose::new(p_m, DQuat::IDENTITY)));
+    // As in the pose thread: the stamp of an accepted pose is the time.
+    referee.handle_timeout(sent.as_ref().map_or(stamp, |sample| sample.stamp));
+    sent
+}
+
+#[test]
+fn repeated_poses_of_a_hover_are_lost_as_no_poses_are() {
+    for (hz, origin) in [(200.0, false), (50.0, false), (10.0, false), (200.0, true), (10.0, true)]
+    {
+        let (mut referee, since_s, last_m) = hovering(hz);
+        let last = *referee.newest().unwrap();
+        let p_m = if origin { DVec3::ZERO } else { last_m };
+        let mut events = Vec::new();
+        for index in 1..=(4.0 * hz) as u32 {
+            let t_s = since_s + f64::from(index) / hz;
+            let _ = send(&mut referee, t_s, p_m);
+            events.extend(std::iter::from_fn(|| referee.poll_event()).map(|event| (t_s, event)));
+            assert_eq!(referee.newest(), Some(&last), "{hz} Hz, {index}");
+        }
+        let [(lost_s, lost), (end_s, end)] = &events[..] else { panic!("{hz} Hz: {events:?}") };
+        assert!(matches!(lost.kind, EventKind::PoseLost { .. }), "{lost:?}");
+        let why = if origin { "not visible" } else { "repeat bit for bit" };
+        assert!(lost.text.contains(why), "{}", lost.text);
+        let due_s = 0.15 + f64::from(last.allowance_s);
+        assert!(
+            (due_s..due_s + 1.01 / hz + 1e-6).contains(&(lost_s - since_s)),
+            "{hz} Hz: {lost_s}"
+        );
+        let ended = EventKind::Ended(EndReason::PoseLost { age_s: 0.5 });
+        assert_eq!(std::mem::discriminant(&end.kind), std::mem::discriminant(&ended), "{end:?}");
+        assert!((0.5..0.5 + 1.01 / hz + 1e-6).contains(&(end_s - since_s)), "{hz} Hz: {end_s}");
+        // The object is visible again: its second pose is the first that is known to be a measurement.
+        let back_s = since_s + 4.0 + 1.0 / hz;
+        send(&mut referee, back_s, DVec3::new(0.1, 0.5, 1.0)).unwrap();
+        assert_eq!(referee.newest(), Some(&last));
+        send(&mut referee, back_s + 1.0 / hz, DVec3::new(0.1001, 0.5, 1.0)).unwrap();
+        let back = referee.poll_event().unwrap();
+        assert!(matches!(back.kind, EventKind::PoseRegained), "{back:?}");
+    }
+}
+
+#[test]
+fn poses_of_a_vehicle_at_rest_on_the_ground_may_repeat() {
+    use FlightPhase::{Connecting, Landed, Preparing, TakingOff, Waiting};
+    for phase in
+        [None, Some(Connecting), Some(Preparing), Some(Waiting), Some(TakingOff), Some(Landed)]
+    {
+        for p_m in [DVec3::ZERO, DVec3::new(1.0, 0.5, 0.01)] {
+            let mut referee = referee(&arena());
+            if let Some(phase) = phase {
+                referee.handle_event(&received(EventKind::Phase(phase)));
+            }
+            for index in 0..1000 {
+                send(&mut referee, 1.0 + 0.01 * f64::from(index), p_m).unwrap();
+            }
+            assert_eq!(referee.poll_event(), None, "{phase:?}");
+        }
+    }
 }
 
 /// Returns a referee with a door that slides through (4, 0) along y, 1 m to each side in 4 s, at the left when

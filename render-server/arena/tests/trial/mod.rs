@@ -197,9 +197,8 @@ impl Trial {
                 truth.rotation * turned,
             );
             let arrival = at(t + self.latency_s);
-            let stamp = at(t);
             let sigma = Some(sigma);
-            let measured = Measured { source: 0, stamp, arrival, world_from_body, sigma };
+            let measured = Measured { arrival, sigma, ..Measured::new(at(t), world_from_body) };
             arrivals.push((t + self.latency_s, Arrival::Pose(measured)));
         }
         if self.imu {

@@ -5,7 +5,8 @@
 //!  "position_m": [1.0, 2.0, 0.5], "rotation_xyzw": [0, 0, 0, 1],
 //!  "position_sigma_m": [0.002, 0.002, 0.004], "rotation_sigma_rad": [0.01, 0.01, 0.01]}
 //! ```
-//! `seq`, `stamp_ns`, `clock` and the sigmas are optional. Stamps use CLOCK_MONOTONIC of this computer
+//! `seq`, `stamp_ns`, `clock`, `tracked` and the sigmas are optional. `"tracked": false` marks a pose of an object
+//! that the sender's system does not see. Stamps use CLOCK_MONOTONIC of this computer
 //! (`"clock": "server"`), or any clock of the sender (`"sender"`, the default), which [`super::sender_clock`]
 //! maps to the server's. Without a stamp, `seq` gives the rhythm. Without either, the arrival is the stamp.
 //! `quality` is the evidence of `vizflyt tags locate`:
@@ -15,14 +16,14 @@
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::SocketAddr;
 
 use glam::{DQuat, DVec3};
 use serde::Deserialize;
 use vizflyt_arena::pose::PoseSigma;
 use vizflyt_protocol::time::ServerTime;
 
-use super::sender_clock::SenderClock;
+use super::sender_clock::{SenderClock, unit_name};
 use super::source::{Measurement, SourceCounters, TagsSeen};
 use super::udp::{PoseStream, Silence};
 use super::vehicle_names::{FrameOrder, VehicleNames};
@@ -40,11 +41,14 @@ pub struct PosePacket<'a> {
     #[serde(default)]
     pub seq: Option<u64>,
     /// Time of measurement. [ns, clock]
-    #[serde(default)]
+    #[serde(default, deserialize_with = "whole_ns")]
     pub stamp_ns: Option<u64>,
     /// Clock of `stamp_ns`.
     #[serde(default)]
     pub clock: StampClock,
+    /// Whether the sender's system sees the object; otherwise the pose is not used.
+    #[serde(default = "is_tracked")]
+    pub tracked: bool,
     /// Position of the object. [m, world]
     pub position_m: [f64; 3],
     /// Rotation from the object's axes to the world's.
@@ -61,6 +65,29 @@ pub struct PosePacket<'a> {
     /// Messages of the sender for users.
     #[serde(borrow, default)]
     pub notes: Vec<Cow<'a, str>>,
+}
+
+fn is_tracked() -> bool {
+    true
+}
+
+/// Reads a whole number of nanoseconds; the error names the unit of any other number by its magnitude.
+fn whole_ns<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<u64>, D::Error> {
+    let Some(number) = Option::<serde_json::Number>::deserialize(deserializer)? else {
+        return Ok(None);
+    };
+    if let Some(ns) = number.as_u64() {
+        return Ok(Some(ns));
+    }
+    let unit = match number.as_f64().unwrap_or(f64::NAN).abs() {
+        ..1e11 => "seconds",
+        ..1e14 => "milliseconds",
+        ..1e17 => "microseconds",
+        _ => "nanoseconds with a point",
+    };
+    Err(serde::de::Error::custom(format!(
+        "stamp_ns is {number}, which looks like {unit}; give whole nanoseconds, in Python time.monotonic_ns()"
+    )))
 }
 
 /// Reads the `quality` of `vizflyt tags locate`; other contents of `quality` are ignored.
@@ -173,6 +200,10 @@ impl JsonStream {
                     return stamp.min(now);
                 }
                 if !std::mem::replace(&mut self.warned_of_clock, true) {
+                    if let Some(unit) = unit_of_clock(stamp_ns, now) {
+                        self.names.warn(wrong_unit(&packet.object, stamp_ns, unit));
+                        return now;
+                    }
                     self.names.warn(format!(
                         "json: '{}' is stamped {age_s:.3} s before it came; `\"clock\": \"server\"` \
                          means CLOCK_MONOTONIC of this very computer: leave `clock` out if the sender \
@@ -185,7 +216,9 @@ impl JsonStream {
             (Some(stamp_ns), StampClock::Sender) => {
                 let clock = &mut self.clocks[vehicle];
                 let stamp = clock.map_in_order(stamp_ns, now);
-                if let Some(jump_s) = clock.take_jump_s() {
+                if let Some(unit) = clock.take_unit(1e-9) {
+                    self.names.warn(wrong_unit(&packet.object, stamp_ns, unit));
+                } else if let Some(jump_s) = clock.take_jump_s() {
                     self.names.warn(format!(
                         "json: the clock that stamps '{}' has jumped by {jump_s:.3} s; if its sender was \
                          not restarted, use a monotonic one (in Python time.monotonic_ns())",
@@ -203,10 +236,6 @@ impl JsonStream {
 }
 
 impl PoseStream for JsonStream {
-    fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
-        self.handle_packet_from(now, NOBODY, bytes)
-    }
-
     fn handle_packet_from(
         &mut self,
         now: ServerTime,
@@ -227,6 +256,9 @@ impl PoseStream for JsonStream {
             self.names.others(std::iter::once(&*packet.object), advice);
             return &[];
         };
+        if !self.names.is_from_sender(vehicle, from, now) {
+            return &[];
+        }
         for note in &packet.notes {
             if let Some(note) = self.notes.news(note, now) {
                 self.names.warn(format!("{}: {note}", packet.object));
@@ -238,6 +270,10 @@ impl PoseStream for JsonStream {
             // The sender's clock may also have restarted.
             Some(FrameOrder::Restarted) => self.clocks[vehicle] = SenderClock::default(),
             Some(FrameOrder::Next) | None => {}
+        }
+        if !packet.tracked {
+            self.names.occluded(vehicle);
+            return &[];
         }
         let stamp = self.stamp(vehicle, &packet, now);
         let sigma = packet
@@ -271,6 +307,21 @@ impl PoseStream for JsonStream {
             later: "does the program that sends pose packets still run?",
         }
     }
+}
+
+fn wrong_unit(object: &str, stamp_ns: u64, unit: &str) -> String {
+    format!(
+        "json: stamp_ns of '{object}' is in {unit} ({stamp_ns}): give nanoseconds, in Python time.monotonic_ns(); till \
+         then poses are stamped as they come"
+    )
+}
+
+/// Returns the unit in which a number is the time `now`, if it is coarser than nanoseconds.
+fn unit_of_clock(stamp: u64, now: ServerTime) -> Option<&'static str> {
+    [(1e-6, 1e3), (1e-3, 1e6), (1.0, 1e9)].into_iter().find_map(|(unit_s, ns)| {
+        let age_s = (now.as_ns() as f64 - stamp as f64 * ns) * 1e-9;
+        (stamp > 0 && age_s.abs() < OLDEST_S).then(|| unit_name(unit_s))?
+    })
 }
 
 /// Notes of senders that were shown recently.
@@ -316,8 +367,6 @@ const MAX_NOTES: usize = 16;
 const FORGOTTEN_S: f64 = 30.0;
 /// Minimum time between new notes; others wait for a later packet. [s]
 const NOTES_APART_S: f64 = 0.5;
-/// Default sender.
-const NOBODY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);
 /// Maximum coordinate: no lab is a thousand kilometres wide, even in millimetres.
 const MAX_VALUE: f64 = 1e9;
 /// Tolerance for two readings of one clock, rounded. [s]

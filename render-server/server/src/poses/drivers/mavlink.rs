@@ -10,7 +10,7 @@ use std::net::SocketAddr;
 
 use glam::{DQuat, DVec3};
 use vizflyt_arena::config::MAX_VEHICLES;
-use vizflyt_arena::pose::PoseSigma;
+use vizflyt_arena::pose::{PoseSigma, Resolution};
 use vizflyt_protocol::mavlink::dialect::{
     ATTITUDE_QUATERNION_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, MavCmd, MavFrame, MavMessage,
     ODOMETRY_DATA,
@@ -22,9 +22,9 @@ use vizflyt_protocol::mavlink::{
 };
 use vizflyt_protocol::time::ServerTime;
 
-use super::sender_clock::SenderClock;
+use super::sender_clock::{SenderClock, unit_name};
 use super::source::{Measurement, SourceCounters};
-use super::udp::{PoseStream, Silence};
+use super::udp::{PoseStream, Silence, UNNAMED};
 use super::vehicle_names::VehicleNames;
 use crate::poses::settings::LocalizationConfig;
 
@@ -64,7 +64,7 @@ struct Attitude {
 impl MavlinkStream {
     /// Creates a stream for the named vehicles; the first has index 0, and so on.
     pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
-        let names = VehicleNames::new(config, source, vehicles);
+        let names = VehicleNames::new(config, source, vehicles).with_resolution(RESOLUTION);
         let systems = vec![System::default(); names.len().min(MAX_VEHICLES)];
         let decoder = StreamDecoder::default();
         Self { names, decoder, packets: Vec::new(), systems, asks: 0, refused: BTreeSet::new() }
@@ -100,6 +100,14 @@ impl MavlinkStream {
                 "set `objects` to the autopilots' system numbers: objects = { bee = \"2\" }";
             return self.names.others(std::iter::once(name.as_str()), advice);
         };
+        if matches!(packet.message, MavMessage::HEARTBEAT(_)) {
+            let pinned = self.names.sender(vehicle);
+            if pinned.is_some_and(|pinned| from != Some(pinned)) {
+                return;
+            }
+        } else if !self.names.is_from_sender(vehicle, from.unwrap_or(UNNAMED), now) {
+            return;
+        }
         let system = &mut self.systems[vehicle];
         if let Some(from) = from {
             system.from = Some((packet.header, from));
@@ -129,7 +137,7 @@ impl MavlinkStream {
                 let turned = attitude.omega_body_radps * (f64::from(dt_ms) * 1e-3);
                 let rotation = attitude.world_from_body * DQuat::from_scaled_axis(turned);
                 let stamp_ns = u64::from(message.time_boot_ms) * 1_000_000;
-                self.measure(vehicle, now, stamp_ns, (p_world_m, rotation), None);
+                self.measure(vehicle, now, (stamp_ns, 1e-3), (p_world_m, rotation), None);
             }
             MavMessage::ODOMETRY(message) => self.handle_odometry(vehicle, now, message),
             _ => {}
@@ -176,15 +184,15 @@ impl MavlinkStream {
             rotation_rad: r2.map(f64::sqrt),
         });
         let rotation = world_rotation_from_ned(rotation.normalize());
-        let stamp_ns = message.time_usec.saturating_mul(1000);
-        self.measure(vehicle, now, stamp_ns, (world_from_ned(p), rotation), sigma);
+        let stamp_ns = message.time_usec.wrapping_mul(1000);
+        self.measure(vehicle, now, (stamp_ns, 1e-6), (world_from_ned(p), rotation), sigma);
     }
 
     fn measure(
         &mut self,
         vehicle: usize,
         now: ServerTime,
-        stamp_ns: u64,
+        (stamp_ns, unit_s): (u64, f64),
         (p_m, rotation): (DVec3, DQuat),
         sigma: Option<PoseSigma>,
     ) {
@@ -201,7 +209,13 @@ impl MavlinkStream {
         }
         system.last_ns = stamp_ns;
         let stamp = system.clock.map_in_order(stamp_ns, now);
-        if let Some(jump_s) = system.clock.take_jump_s() {
+        if let Some(unit) = system.clock.take_unit(unit_s) {
+            let expected = unit_name(unit_s).unwrap_or_default();
+            self.names.warn(format!(
+                "mavlink: the stamps of the poses are in {unit} instead of {expected}; correct the sender: till then \
+                 poses are stamped as they come"
+            ));
+        } else if let Some(jump_s) = system.clock.take_jump_s() {
             self.names.warn(format!(
                 "mavlink: the autopilot's clock has jumped by {jump_s:.3} s; has it rebooted?"
             ));
@@ -303,6 +317,8 @@ impl PoseStream for MavlinkStream {
     }
 }
 
+/// An estimator that does not get measurements keeps its position, but turns with its gyroscope.
+const RESOLUTION: Resolution = Resolution { position_m: 0.0, rotation_rad: std::f64::consts::PI };
 /// MAV_COMP_ID_AUTOPILOT1.
 const AUTOPILOT: u8 = 1;
 /// Our system id: not one of a ground station, so that the autopilot does not treat us as one.

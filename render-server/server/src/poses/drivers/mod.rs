@@ -4,6 +4,7 @@
 //! datagrams -> udp (socket), arrival (the kernel's stamp) -> vicon, natnet, json, mavlink (bytes -> objects)
 //! bytes ----> vrpn::connection (TCP, arrival stamp) -> vrpn
 //!           -> vehicle_names (vehicle of an object; world frame; counters; warnings)
+//!           -> sender (one sender for each vehicle)
 //!           -> frame_clock, sender_clock (stamps without network jitter)
 //!           -> Measurements -> multi_source (for several sources) -> pose thread
 //! ```
@@ -13,9 +14,12 @@
 mod arrival;
 pub mod frame_clock;
 pub mod json;
+#[cfg(test)]
+mod lost_poses;
 pub mod mavlink;
 mod multi_source;
 pub mod natnet;
+mod sender;
 pub mod sender_clock;
 mod slew;
 mod source;

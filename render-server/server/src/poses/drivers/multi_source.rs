@@ -122,6 +122,7 @@ const PATIENCE: Duration = Duration::from_millis(100);
 mod tests {
     use super::*;
     use glam::{DQuat, DVec3};
+    use vizflyt_arena::pose::Resolution;
     use vizflyt_protocol::geometry::Pose;
     use vizflyt_protocol::time::ServerTime;
 
@@ -145,6 +146,8 @@ mod tests {
                     arrival: ServerTime::ZERO,
                     world_from_body: Pose::new(DVec3::ZERO, DQuat::IDENTITY),
                     sigma: None,
+                    is_origin: false,
+                    resolution: Resolution::default(),
                 });
             } else {
                 std::thread::yield_now();

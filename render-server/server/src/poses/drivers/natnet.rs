@@ -23,7 +23,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::sender_clock::SenderClock;
 use super::source::{Measurement, SourceCounters};
-use super::udp::{PoseStream, Silence};
+use super::udp::{PoseStream, Silence, UNNAMED};
 use super::vehicle_names::{FrameOrder, VehicleNames};
 use crate::poses::settings::LocalizationConfig;
 
@@ -53,6 +53,7 @@ pub struct NatnetStream {
     kept_alive: Option<ServerTime>,
     received_at: Option<ServerTime>,
     warned_of_version: bool,
+    warned_of_sender: bool,
 }
 
 /// State of the connected Motive.
@@ -84,6 +85,7 @@ impl NatnetStream {
             kept_alive: None,
             received_at: None,
             warned_of_version: false,
+            warned_of_sender: false,
         }
     }
 
@@ -141,7 +143,7 @@ impl NatnetStream {
         }
     }
 
-    fn handle_frame(&mut self, now: ServerTime, bytes: &[u8]) {
+    fn handle_frame(&mut self, now: ServerTime, from: SocketAddr, bytes: &[u8]) {
         let Some(session) = &mut self.session else { return };
         let frame = match session.decoder.parse(bytes).map(natnet::DecodedMessage::into_message) {
             Ok(Message::FrameOfData(frame)) => frame,
@@ -159,7 +161,9 @@ impl NatnetStream {
                 self.session.as_ref().and_then(|session| *session.vehicles.get(&body.id)?);
             // A rigid body may also be configured by its streaming id.
             let vehicle = named.or_else(|| self.names.find(body.id.to_string().as_bytes()));
-            if let Some(vehicle) = vehicle {
+            if let Some(vehicle) = vehicle
+                && self.names.is_from_sender(vehicle, from, now)
+            {
                 self.handle_body(vehicle, &frame, body, (stamp, now));
             }
         }
@@ -215,6 +219,48 @@ impl NatnetStream {
         Some(sent.plus_ns(-(age_ns.min(OLDEST_NS) as i64)))
     }
 
+    fn handle_message(
+        &mut self,
+        now: ServerTime,
+        from: SocketAddr,
+        bytes: &[u8],
+    ) -> &[Measurement] {
+        self.names.begin();
+        match MessageHeader::parse(bytes).map(|header| header.message_id) {
+            Ok(NAT_SERVERINFO) => self.handle_info(bytes),
+            Ok(NAT_MODELDEF) => self.handle_names(bytes),
+            Ok(NAT_FRAMEOFDATA) => self.handle_frame(now, from, bytes),
+            // Other messages between Motive and its clients.
+            Ok(id) if id <= MAX_ID => {}
+            Ok(id) => self.names.bad(&format!("message {id} is not NatNet's"), NOT_MOTIVE),
+            Err(error) => self.names.bad(&error, NOT_MOTIVE),
+        }
+        self.names.measured()
+    }
+
+    /// Returns whether a packet comes from the server's computer. By unicast, this is the configured one. By
+    /// multicast, frames of any computer are compared by [`VehicleNames::is_from_sender`], so that two senders are
+    /// noticed, and another computer is asked for names after the first one is silent.
+    fn is_from_server(&mut self, now: ServerTime, from: SocketAddr) -> bool {
+        let command = SocketAddr::new(from.ip(), COMMAND_PORT);
+        let server = *self.server.get_or_insert(command);
+        if server.ip() == from.ip() {
+            return true;
+        }
+        if self.motive != Motive::Multicast {
+            if !std::mem::replace(&mut self.warned_of_sender, true) {
+                self.names.warn(format!(
+                    "natnet: packets of {from} are ignored: poses are requested from {server}"
+                ));
+            }
+            return false;
+        }
+        if self.received_at.is_none_or(|at| now.seconds_since(at) > FORGOTTEN_S) {
+            (self.server, self.session) = (Some(command), None);
+        }
+        true
+    }
+
     fn is_due(at: &mut Option<ServerTime>, now: ServerTime, every_s: f64) -> bool {
         let due = at.is_none_or(|at| now.seconds_since(at) >= every_s);
         if due {
@@ -252,17 +298,7 @@ impl NatnetStream {
 
 impl PoseStream for NatnetStream {
     fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
-        self.names.begin();
-        match MessageHeader::parse(bytes).map(|header| header.message_id) {
-            Ok(NAT_SERVERINFO) => self.handle_info(bytes),
-            Ok(NAT_MODELDEF) => self.handle_names(bytes),
-            Ok(NAT_FRAMEOFDATA) => self.handle_frame(now, bytes),
-            // Other messages between Motive and its clients.
-            Ok(id) if id <= MAX_ID => {}
-            Ok(id) => self.names.bad(&format!("message {id} is not NatNet's"), NOT_MOTIVE),
-            Err(error) => self.names.bad(&error, NOT_MOTIVE),
-        }
-        self.names.measured()
+        self.handle_message(now, UNNAMED, bytes)
     }
 
     fn handle_packet_from(
@@ -271,10 +307,11 @@ impl PoseStream for NatnetStream {
         from: SocketAddr,
         bytes: &[u8],
     ) -> &[Measurement] {
-        if self.server.is_none() {
-            self.server = Some(SocketAddr::new(from.ip(), COMMAND_PORT));
+        if self.is_from_server(now, from) {
+            return self.handle_message(now, from, bytes);
         }
-        self.handle_packet(now, bytes)
+        self.names.begin();
+        self.names.measured()
     }
 
     fn poll_transmit(&mut self, now: ServerTime) -> Option<(SocketAddr, Vec<u8>)> {

@@ -21,6 +21,11 @@ pub struct SenderClock {
     last: Option<ServerTime>,
     slew: Slew,
     jump_s: Option<f64>,
+    /// First packet of the last seconds: stamp and arrival.
+    first: Option<(u64, ServerTime)>,
+    /// Power of 1000 by which the stamps advance too fast, because they are in another unit than nanoseconds.
+    scale: Option<f64>,
+    has_new_scale: bool,
 }
 
 impl Default for SenderClock {
@@ -32,17 +37,24 @@ impl Default for SenderClock {
             last: None,
             slew: Slew::default(),
             jump_s: None,
+            first: None,
+            scale: None,
+            has_new_scale: false,
         }
     }
 }
 
 impl SenderClock {
     /// Maps the sender's time `sent_ns` of a packet that came at `arrival` to the server's clock. The result is
-    /// never later than `arrival`. [ns, sender]
+    /// never later than `arrival`; it is `arrival` while the stamps are in another unit. [ns, sender]
     pub fn map(&mut self, sent_ns: u64, arrival: ServerTime) -> ServerTime {
         // Clocks of any two computers are less than 292 years apart.
         let offset_ns = arrival.as_ns().wrapping_sub(sent_ns).cast_signed();
         let second = arrival.as_ns() / 1_000_000_000;
+        let is_early = self.check_unit(sent_ns, arrival);
+        if self.scale.is_some() {
+            return arrival;
+        }
         if let Some(least_ns) = self.least_ns(second) {
             let late_s = offset_ns.wrapping_sub(least_ns) as f64 * 1e-9;
             // A clock that was set forward makes packets arrive before they were sent. A clock that was set
@@ -55,7 +67,7 @@ impl SenderClock {
             if slipped || restarted || late_s < -SLIP_S {
                 self.slew.slip(if restarted { f64::INFINITY } else { late_s });
                 // The jump of the clock equals the apparent earliness of its packets.
-                self.jump_s = Some(-late_s);
+                self.jump_s = (!is_early).then_some(-late_s);
                 self.buckets = [None; BUCKETS];
                 (self.late_since, self.fallen) = (None, None);
             }
@@ -83,6 +95,38 @@ impl SenderClock {
         self.jump_s.take()
     }
 
+    /// Returns the unit of the stamps, if it is not the expected `unit_s`; once for each wrong unit. [s]
+    pub fn take_unit(&mut self, unit_s: f64) -> Option<&'static str> {
+        let scale = self.scale.filter(|_| std::mem::take(&mut self.has_new_scale))?;
+        unit_name(unit_s / scale)
+    }
+
+    /// Compares the advance of the stamps with that of the arrivals. Returns whether it is too early to distinguish
+    /// another unit from a clock that was set.
+    fn check_unit(&mut self, sent_ns: u64, arrival: ServerTime) -> bool {
+        let &mut (first_ns, first_at) = self.first.get_or_insert((sent_ns, arrival));
+        let past_s = arrival.seconds_since(first_at);
+        let Some(sent_s) = sent_ns.checked_sub(first_ns).map(|ns| ns as f64 * 1e-9) else {
+            self.first = None;
+            return false;
+        };
+        let rate = sent_s / past_s.max(1e-9);
+        let is_usual = (1e-2..1e2).contains(&rate);
+        if past_s < UNIT_S {
+            return past_s > 0.0 && !is_usual;
+        }
+        self.first = Some((sent_ns, arrival));
+        let scale = 1e3f64.powf((rate.log10() / 3.0).round());
+        let is_unit = !is_usual && (0.5..2.0).contains(&(rate / scale));
+        // Stamps in whole seconds advance in steps.
+        let scale = if rate > 0.0 && rate < 2e-9 { Some(1e-9) } else { is_unit.then_some(scale) };
+        if scale != self.scale {
+            (self.scale, self.has_new_scale) = (scale, scale.is_some());
+            (self.buckets, self.late_since, self.fallen) = ([None; BUCKETS], None, None);
+        }
+        false
+    }
+
     /// Returns whether packets with lower stamps arrive at even intervals: the sender or its computer
     /// restarted. A burst after a pause arrives at once, and reordered packets arrive one at a time.
     fn has_restarted(&mut self, sent_ns: u64, arrival: ServerTime, late_s: f64) -> bool {
@@ -108,6 +152,15 @@ impl SenderClock {
     }
 }
 
+/// Returns the name of a unit of time; `None` if there is none of this size. [s]
+pub(super) fn unit_name(unit_s: f64) -> Option<&'static str> {
+    let units =
+        [(1e-9, "nanoseconds"), (1e-6, "microseconds"), (1e-3, "milliseconds"), (1.0, "seconds")];
+    units.into_iter().find(|(s, _)| (0.5..2.0).contains(&(unit_s / s))).map(|(_, name)| name)
+}
+
+/// Time over which stamps are compared with arrivals: stamps in whole seconds advance at least once. [s]
+const UNIT_S: f64 = 1.5;
 /// Length of the history. [s]
 const BUCKETS: usize = 10;
 /// A delay above this for [`SLIP_LASTS_S`] is not caused by the network of a lab. [s]

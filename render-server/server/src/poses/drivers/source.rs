@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use vizflyt_arena::pose::{Measured, PoseSigma};
+use vizflyt_arena::pose::{Measured, PoseSigma, Resolution};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::ServerTime;
 
@@ -22,13 +22,18 @@ pub struct Measurement {
     pub world_from_body: Pose<World, Body>,
     /// Standard deviations, if the source states them.
     pub sigma: Option<PoseSigma>,
+    /// Whether the streamed position is exactly 0, 0, 0.
+    pub is_origin: bool,
+    /// Differences up to which two poses of the source are equal.
+    pub resolution: Resolution,
 }
 
 impl Measurement {
     /// Returns the input for the pose filter.
     pub fn with_covariance(&self) -> Measured {
-        let Self { source, stamp, arrival, world_from_body, sigma, .. } = *self;
-        Measured { source, stamp, arrival, world_from_body, sigma }
+        let Self { source, stamp, arrival, world_from_body, sigma, is_origin, resolution, .. } =
+            *self;
+        Measured { source, stamp, arrival, world_from_body, sigma, is_origin, resolution }
     }
 }
 

@@ -15,18 +15,18 @@ use crate::poses::settings::Driver;
 
 /// Parser of a pose stream: bytes in, poses out. Sans-IO.
 pub trait PoseStream: Send {
-    /// Processes one datagram that arrived at `now`. Returns the contained poses of the configured vehicles
-    /// that are newer than the last, at most one per vehicle.
-    fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement];
-
-    /// Like [`Self::handle_packet`], for streams that reply to their sender.
+    /// Processes one datagram of `from` that arrived at `now`. Returns the contained poses of the configured
+    /// vehicles that are newer than the last, at most one per vehicle.
     fn handle_packet_from(
         &mut self,
         now: ServerTime,
-        _from: SocketAddr,
+        from: SocketAddr,
         bytes: &[u8],
-    ) -> &[Measurement] {
-        self.handle_packet(now, bytes)
+    ) -> &[Measurement];
+
+    /// Like [`Self::handle_packet_from`], for a source with a single unnamed sender.
+    fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
+        self.handle_packet_from(now, UNNAMED, bytes)
     }
 
     /// Returns the next datagram to send, with its destination. Called after each packet, and ten times a
@@ -197,6 +197,8 @@ impl<S: PoseStream> PoseSource for UdpPoses<S> {
     }
 }
 
+/// Address of an unnamed sender.
+pub(super) const UNNAMED: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);
 /// 1 MiB holds 3 s of 1024-byte packets at 300 Hz.
 const RECEIVE_BUFFER: usize = 1 << 20;
 /// Silence before a warning: a hundred frames at 200 Hz. [s]

@@ -3,13 +3,15 @@
 
 use std::collections::VecDeque;
 use std::fmt::Display;
+use std::net::SocketAddr;
 
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_arena::config::MAX_VEHICLES;
-use vizflyt_arena::pose::PoseSigma;
+use vizflyt_arena::pose::{PoseSigma, Resolution};
 use vizflyt_protocol::time::ServerTime;
 
 use super::frame_clock::FrameClock;
+use super::sender::{Heard, Sender};
 use super::source::{Measurement, SourceCounters};
 use crate::poses::settings::{Alignment, Driver, LocalizationConfig};
 
@@ -21,6 +23,7 @@ pub(super) struct VehicleNames {
     alignment: Alignment,
     /// Constant delay of the source. [s]
     latency_s: f64,
+    resolution: Resolution,
     objects: Vec<Object>,
     bad_packets: u64,
     /// Measurements of the newest packet.
@@ -36,6 +39,7 @@ pub(super) struct VehicleNames {
 #[derive(Debug)]
 struct Object {
     name: String,
+    sender: Sender,
     clock: FrameClock,
     last_frame: Option<u32>,
     /// Time of the last frame, and mean interval. [s]
@@ -55,6 +59,7 @@ impl VehicleNames {
     pub(super) fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
         let object = |vehicle: &&str| Object {
             name: config.object_of(vehicle).to_owned(),
+            sender: Sender::default(),
             clock: FrameClock::default(),
             last_frame: None,
             last_at: ServerTime::ZERO,
@@ -69,6 +74,7 @@ impl VehicleNames {
             source,
             alignment: config.alignment(),
             latency_s: config.latency_ms * 1e-3,
+            resolution: Resolution::default(),
             objects: vehicles.iter().take(MAX_VEHICLES).map(object).collect(),
             bad_packets: 0,
             measured: Vec::with_capacity(MAX_VEHICLES),
@@ -77,6 +83,12 @@ impl VehicleNames {
             warned_of_far: false,
             warnings: VecDeque::new(),
         }
+    }
+
+    /// Sets the differences up to which two poses are equal; bit for bit by default.
+    #[must_use]
+    pub(super) fn with_resolution(self, resolution: Resolution) -> Self {
+        Self { resolution, ..self }
     }
 
     /// Returns the vehicle of the object with this name.
@@ -96,6 +108,38 @@ impl VehicleNames {
     /// Returns the measurements of the packet.
     pub(super) fn measured(&self) -> &[Measurement] {
         &self.measured
+    }
+
+    /// Returns the address to which the stream of a vehicle is pinned.
+    pub(super) fn sender(&self, vehicle: usize) -> Option<SocketAddr> {
+        self.objects[vehicle].sender.pinned()
+    }
+
+    /// Processes the address of a packet with a pose of a vehicle. Returns whether the packet may be used: it is of
+    /// the pinned sender, and no other sends poses of the vehicle.
+    pub(super) fn is_from_sender(
+        &mut self,
+        vehicle: usize,
+        from: SocketAddr,
+        now: ServerTime,
+    ) -> bool {
+        let object = &mut self.objects[vehicle];
+        let heard = object.sender.handle_packet(from, now);
+        let (driver, name) = (self.driver, &object.name);
+        let text = match heard {
+            Heard::Pinned | Heard::TookOver(None) => return true,
+            Heard::Other | Heard::Conflict(None) => return false,
+            Heard::TookOver(Some(former)) => format!(
+                "{driver}: poses of '{name}' now come from {from}, since {former} is silent (if this is one program, \
+                 let it keep its port)"
+            ),
+            Heard::Conflict(Some(other)) => format!(
+                "{driver}: {from} and {other} both send poses of '{name}'; none is used while both send: stop one of \
+                 them"
+            ),
+        };
+        self.warn(text);
+        matches!(heard, Heard::TookOver(_))
     }
 
     /// Processes the frame number of a vehicle, and counts. Returns whether the frame is newer than the last
@@ -183,7 +227,16 @@ impl VehicleNames {
         });
         self.objects[vehicle].counters.poses += 1;
         let (source, stamp) = (self.source, stamp.plus_seconds(-self.latency_s));
-        self.measured.push(Measurement { vehicle, source, stamp, arrival, world_from_body, sigma });
+        self.measured.push(Measurement {
+            vehicle,
+            source,
+            stamp,
+            arrival,
+            world_from_body,
+            sigma,
+            is_origin: p_stream == DVec3::ZERO,
+            resolution: self.resolution,
+        });
     }
 
     fn notice_far(&mut self, vehicle: usize, far_m: f64) {

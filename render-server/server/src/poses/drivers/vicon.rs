@@ -16,6 +16,8 @@
 //! arrival on CLOCK_MONOTONIC, less the jitter that [`super::frame_clock`] determines from the frame counter.
 //! The constant delay of Tracker (a few ms) remains.
 
+use std::net::SocketAddr;
+
 use glam::DVec3;
 use vizflyt_arena::config::MAX_VEHICLES;
 use vizflyt_protocol::time::ServerTime;
@@ -130,7 +132,12 @@ impl ViconStream {
 }
 
 impl PoseStream for ViconStream {
-    fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
+    fn handle_packet_from(
+        &mut self,
+        now: ServerTime,
+        from: SocketAddr,
+        bytes: &[u8],
+    ) -> &[Measurement] {
         self.names.begin();
         let mut found = [None; MAX_VEHICLES];
         let mut others = heapless::Vec::<_, MAX_NAMES>::new();
@@ -153,7 +160,9 @@ impl PoseStream for ViconStream {
         }
         for (vehicle, object) in found.into_iter().enumerate() {
             let Some(object) = object else { continue };
-            if self.names.is_next(vehicle, frame, now) == FrameOrder::Old {
+            if !self.names.is_from_sender(vehicle, from, now)
+                || self.names.is_next(vehicle, frame, now) == FrameOrder::Old
+            {
                 continue;
             }
             let Some(angles_rad) = object.angles_rad else {

@@ -236,7 +236,9 @@ impl Emitter {
             while !stop2.load(Ordering::Relaxed) {
                 if !paused2.load(Ordering::Relaxed) {
                     frame += 1;
-                    let values = [x_m(frame) * 1e3, 0.0, HEIGHT_M * 1e3, 0.0, 0.0, 0.0];
+                    // Measurements in the air never repeat.
+                    let noise_mm = 1e-6 * f64::from(frame % 3);
+                    let values = [x_m(frame) * 1e3, noise_mm, HEIGHT_M * 1e3, 0.0, 0.0, 0.0];
                     let _ = socket.send_to(&vicon_packet(frame, object, values), to);
                     sent2.store(frame, Ordering::Relaxed);
                 }

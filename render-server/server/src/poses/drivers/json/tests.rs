@@ -1,5 +1,8 @@
 use super::*;
+use crate::poses::drivers::lost_poses;
+use crate::poses::settings::Driver;
 use proptest::prelude::*;
+use vizflyt_arena::pose::Rejected;
 
 fn stream(settings: &str) -> JsonStream {
     let config = LocalizationConfig::parse(&format!("json:127.0.0.1:0,{settings}")).unwrap();
@@ -210,4 +213,70 @@ fn reports_the_tags_of_a_pose_and_the_view() {
     assert_eq!(quality_of(20, seen).expect("tags are reported").view, None);
     // An unknown `quality` of another program does not invalidate the pose.
     assert_eq!(quality_of(30, r#""good""#), None);
+}
+
+fn hovering(index: u32, p_m: DVec3) -> Vec<u8> {
+    let stamp_ns = u64::from(index) * 20_000_000;
+    let more = format!(r#","seq":{index},"stamp_ns":{stamp_ns}"#);
+    packet(&more).replace("[1,2,3]", &format!("{:?}", p_m.to_array())).into_bytes()
+}
+
+#[test]
+fn poses_of_a_hidden_object_are_missing() {
+    let reason = |origin| lost_poses::reason_of(origin, &mut stream(""), hovering);
+    assert!(matches!(reason(false), Some(Rejected::Repeated(_))));
+    assert_eq!(reason(true), Some(Rejected::NotVisible));
+    // The origin is the sender's, wherever it is in the room.
+    let mut config = LocalizationConfig::new(Driver::Json);
+    config.offset.position_m = DVec3::new(1.0, 2.0, 0.0);
+    let moved = &mut JsonStream::new(&config, 0, &["vizflyt"]);
+    assert_eq!(lost_poses::reason_of(true, moved, hovering), Some(Rejected::NotVisible));
+}
+
+#[test]
+fn stream_of_a_vehicle_has_one_sender() {
+    lost_poses::check_second_sender(&mut stream(""), hovering);
+}
+
+#[test]
+fn counts_poses_that_are_marked_as_not_tracked() {
+    let mut s = stream("");
+    assert!(only(&mut s, at(0), &packet(r#","tracked":true"#)).is_some());
+    assert_eq!(only(&mut s, at(10), &packet(r#","tracked":false"#)), None);
+    assert_eq!((s.counters(0).occluded, s.next_warning()), (1, None));
+}
+
+#[test]
+fn names_the_unit_of_stamps() {
+    for (unit, ns) in [("seconds", 1e9), ("milliseconds", 1e6), ("microseconds", 1e3)] {
+        for start_s in [0.0, 1.8e9] {
+            let mut s = stream("");
+            let mut warnings = Vec::new();
+            for index in 0..1000 {
+                let sent = (start_s + 0.01 * f64::from(index)) * 1e9 / ns;
+                let text = packet(&format!(r#","stamp_ns":{}"#, sent as u64));
+                let now = at(10 * index as u64);
+                let found = only(&mut s, now, &text).unwrap();
+                assert!(index < 200 || found.stamp == now, "{unit} at {index}");
+                warnings.extend(std::iter::from_fn(|| s.next_warning()));
+            }
+            let [warning] = &warnings[..] else { panic!("{unit}: {warnings:?}") };
+            assert!(warning.contains(&format!("is in {unit}")), "{warning}");
+        }
+        // The server's clock.
+        let mut s = stream("");
+        let stamp = (at(0).as_ns() as f64 + 4e9) / ns;
+        let text = packet(&format!(r#","stamp_ns":{stamp:.0},"clock":"server""#));
+        only(&mut s, at(4000), &text).unwrap();
+        let warning = s.next_warning().unwrap();
+        assert!(warning.contains(&format!("is in {unit}")), "{warning}");
+    }
+    for (stamp, unit) in
+        [("1764358.25", "seconds"), ("1.7643e15", "microseconds"), ("1.7643e18", "a point")]
+    {
+        let mut s = stream("");
+        assert_eq!(only(&mut s, at(0), &packet(&format!(r#","stamp_ns":{stamp}"#))), None);
+        let warning = s.next_warning().unwrap();
+        assert!(warning.contains("looks like") && warning.contains(unit), "{warning}");
+    }
 }

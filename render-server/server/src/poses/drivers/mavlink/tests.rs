@@ -1,6 +1,10 @@
 use super::*;
+use crate::poses::drivers::lost_poses;
 use proptest::prelude::*;
-use vizflyt_protocol::mavlink::dialect::{LOCAL_POSITION_NED_DATA, MavAutopilot, MavType};
+use vizflyt_arena::pose::Rejected;
+use vizflyt_protocol::mavlink::dialect::{
+    HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot, MavType,
+};
 use vizflyt_protocol::mavlink::{
     attitude_to_mavlink, local_position_to_mavlink, ned_rotation_from_world,
 };
@@ -167,4 +171,43 @@ proptest! {
             prop_assert!(found.world_from_body.is_valid());
         }
     }
+}
+
+fn hovering(index: u32, p_m: DVec3) -> Vec<u8> {
+    let boot_ms = 5000 + 20 * index;
+    // The attitude is of the gyroscope, which does not stand still.
+    let turned = DQuat::from_rotation_z(0.3 + 1e-3 * f64::from(index % 11));
+    [quaternion(1, boot_ms, turned, 0.1), position(1, boot_ms, p_m)].concat()
+}
+
+#[test]
+fn estimates_without_measurements_are_missing() {
+    let reason = |origin| lost_poses::reason_of(origin, &mut stream("", &["vizflyt"]), hovering);
+    assert!(matches!(reason(false), Some(Rejected::Repeated(_))));
+    assert_eq!(reason(true), Some(Rejected::NotVisible));
+}
+
+#[test]
+fn stream_of_a_vehicle_has_one_sender() {
+    lost_poses::check_second_sender(&mut stream("", &["vizflyt"]), hovering);
+}
+
+#[test]
+fn names_the_unit_of_stamps() {
+    let mut s = stream("", &["vizflyt"]);
+    let mut warnings = Vec::new();
+    for index in 0..300u64 {
+        let odometry = ODOMETRY_DATA {
+            // Nanoseconds.
+            time_usec: 1_800_000_000_000_000_000 + index * 10_000_000,
+            frame_id: MavFrame::MAV_FRAME_LOCAL_NED,
+            q: [1.0, 0.0, 0.0, 0.0],
+            z: index as f32 * 1e-3,
+            ..ODOMETRY_DATA::default()
+        };
+        s.handle_packet(at(10 * index), &packet(1, &MavMessage::ODOMETRY(odometry)));
+        warnings.extend(std::iter::from_fn(|| s.next_warning()));
+    }
+    let [warning] = &warnings[..] else { panic!("{warnings:?}") };
+    assert!(warning.contains("in nanoseconds instead of microseconds"), "{warning}");
 }

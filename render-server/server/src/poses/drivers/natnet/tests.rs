@@ -1,6 +1,8 @@
 use super::*;
+use crate::poses::drivers::lost_poses;
 use natnet::{ConnectionInfo, DataSet, ModelDef, PlannedBody, RigidBodyDef, SyntheticServer};
 use proptest::prelude::*;
+use vizflyt_arena::pose::Rejected;
 
 const SERVER: &str = "10.0.0.5:1510";
 
@@ -181,4 +183,42 @@ proptest! {
             prop_assert!(found.world_from_body.is_valid() && found.stamp <= found.arrival);
         }
     }
+}
+
+fn connected() -> NatnetStream {
+    let mut s = stream("", unicast());
+    s.handle_packet(at(0), &info(Version::V4_1));
+    s.handle_packet(at(0), &names(Version::V4_1, &[("bee", 7)]));
+    s
+}
+
+fn hovering(index: u32, p_m: DVec3) -> Vec<u8> {
+    let body = PlannedBody::tracked(7, p_m.as_vec3().to_array(), [0.0, 0.0, 0.0, 1.0]);
+    let exposed_s = 50.0 + 0.02 * f64::from(index);
+    frame(Version::V4_1, index as i32 + 1, exposed_s, &[body])
+}
+
+#[test]
+fn poses_of_a_hidden_object_are_missing_even_if_marked_as_tracked() {
+    let reason = |origin| lost_poses::reason_of(origin, &mut connected(), hovering);
+    assert!(matches!(reason(false), Some(Rejected::Repeated(_))));
+    assert_eq!(reason(true), Some(Rejected::NotVisible));
+}
+
+#[test]
+fn stream_of_a_vehicle_has_one_sender() {
+    lost_poses::check_second_sender(&mut connected(), hovering);
+}
+
+#[test]
+fn packets_of_another_computer_are_ignored_once_requested_by_unicast() {
+    let mut s = connected();
+    let other = "10.0.0.66:1511".parse().unwrap();
+    for index in 0..3 {
+        let bytes = hovering(index, DVec3::ONE);
+        assert_eq!(s.handle_packet_from(at(u64::from(index) * 20), other, &bytes), []);
+    }
+    let warning = s.next_warning().unwrap();
+    assert!(warning.contains("10.0.0.66:1511") && warning.contains(SERVER), "{warning}");
+    assert_eq!(s.next_warning(), None);
 }

@@ -1,7 +1,9 @@
 use super::*;
+use crate::poses::drivers::lost_poses;
 use crate::poses::settings::Driver;
 use glam::DQuat;
 use proptest::prelude::*;
+use vizflyt_arena::pose::Rejected;
 
 fn stream(vehicles: &[&str]) -> ViconStream {
     ViconStream::new(&LocalizationConfig::new(Driver::Vicon), 0, vehicles)
@@ -192,4 +194,23 @@ proptest! {
             prop_assert!(pose.world_from_body.is_valid());
         }
     }
+}
+
+fn hovering(index: u32, p_m: DVec3) -> Vec<u8> {
+    let [x, y, z] = (1e3 * p_m).to_array();
+    let turned = if p_m == DVec3::ZERO { 0.0 } else { 0.3 };
+    packet(index, &[("v", [x, y, z, 0.0, 0.0, turned])])
+}
+
+#[test]
+fn poses_of_a_hidden_object_are_missing() {
+    let reason = |origin| lost_poses::reason_of(origin, &mut stream(&["v"]), hovering);
+    assert!(matches!(reason(false), Some(Rejected::Repeated(_))));
+    // All zeros mean that Tracker does not see the object.
+    assert_eq!(reason(true), None);
+}
+
+#[test]
+fn stream_of_a_vehicle_has_one_sender() {
+    lost_poses::check_second_sender(&mut stream(&["v"]), hovering);
 }

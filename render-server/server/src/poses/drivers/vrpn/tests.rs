@@ -1,5 +1,7 @@
 use super::*;
+use crate::poses::drivers::lost_poses;
 use proptest::prelude::*;
+use vizflyt_arena::pose::Rejected;
 
 /// TCP data sent by a server with the library of VRPN 7.38 to a client that sent only [`COOKIE`]: a tracker
 /// "vizflyt" that moves in a circle at 100 Hz, and a tracker "wasp" with two sensors at rest. The last report
@@ -308,4 +310,20 @@ proptest! {
         prop_assert_eq!(found[0].world_from_body.translation_m, DVec3::from(p));
         prop_assert!(found[0].world_from_body.rotation.dot(q).abs() > 1.0 - 1e-9);
     }
+}
+
+#[test]
+fn poses_of_a_hidden_object_are_missing() {
+    let reason = |origin| {
+        let mut s = stream("");
+        s.handle_bytes(at(0), &beginning(&[("vizflyt", 4)]));
+        lost_poses::reason(origin, |now, index, p_m| {
+            let [x, y, z] = p_m.to_array();
+            let stamp_us = 1_000_000 + 20_000 * u64::from(index);
+            let numbers = [x, y, z, 0.0, 0.0, 0.0, 1.0];
+            poses_of(&mut s, now, &report(stamp_us, 4, 0, numbers)).first().copied()
+        })
+    };
+    assert!(matches!(reason(false), Some(Rejected::Repeated(_))));
+    assert_eq!(reason(true), Some(Rejected::NotVisible));
 }
