@@ -4,12 +4,19 @@
     python3 crazyflie_pose.py radio://0/80/2M/E7E7E7E7E7 192.168.1.20:51002 vizflyt
 
 The Crazyflie's world is z up, its body x forward, y left, z up, as VizFlyt's. Its log carries at most
-26 bytes a packet: the compressed estimate, position in millimetres and the quaternion in 32 bits, fits.
+26 bytes a packet: the compressed estimate, position in millimetres and the quaternion in 32 bits, fits, and
+the variances of the position. A position with a standard deviation above 0.5 m is sent as not tracked.
 """
 import json
 import math
 import socket
 import sys
+
+
+VARIANCES = ["kalman.varP" + axis for axis in "XYZ"]
+# The Crazyflie logs no variance of its attitude.
+ROTATION_SIGMA_RAD = 0.02
+MAX_SIGMA_M = 0.5
 
 
 def unpacked(bits):
@@ -32,14 +39,22 @@ def packet(object_name, seq, timestamp_ms, data):
     """Returns the bytes of a pose packet from one record of the log."""
     # stateEstimateZ counts millimetres.
     position = [data["stateEstimateZ." + axis] / 1000.0 for axis in "xyz"]
-    return json.dumps({
+    pose = {
         "vizflyt_pose": 1,
         "object": object_name,
         "seq": seq,
         "stamp_ns": timestamp_ms * 1_000_000,
         "position_m": position,
         "rotation_xyzw": unpacked(data["stateEstimateZ.quat"]),
-    }).encode()
+    }
+    variances = [data[name] for name in VARIANCES if name in data]
+    if variances:
+        sigmas = [math.sqrt(value) if value >= 0 else math.inf for value in variances]
+        pose["tracked"] = all(sigma <= MAX_SIGMA_M for sigma in sigmas)
+        if pose["tracked"]:
+            pose["position_sigma_m"] = [max(sigma, 1e-3) for sigma in sigmas]
+            pose["rotation_sigma_rad"] = [ROTATION_SIGMA_RAD] * 3
+    return json.dumps(pose).encode()
 
 
 def main(uri, server, object_name="vizflyt"):
@@ -57,6 +72,10 @@ def main(uri, server, object_name="vizflyt"):
     log.add_variable("stateEstimateZ.quat", "uint32_t")
     cflib.crtp.init_drivers()
     with SyncCrazyflie(uri, cf=Crazyflie(rw_cache="./cache")) as crazyflie:
+        for name in VARIANCES:
+            # Only the Kalman estimator has them.
+            if crazyflie.cf.log.toc.get_element_by_complete_name(name) is not None:
+                log.add_variable(name, "float")
         with SyncLogger(crazyflie, log) as records:
             for seq, (timestamp_ms, data, _) in enumerate(records):
                 udp.sendto(packet(object_name, seq, timestamp_ms, data), (host, int(port)))

@@ -39,7 +39,26 @@ def test_a_ros_pose_becomes_a_packet():
         "vizflyt_pose": 1, "object": "bee", "seq": 7, "stamp_ns": 12_000_000_034,
         "position_m": [1.0, 2.0, 3.0], "rotation_xyzw": [0.0, 0.0, 0.6, 0.8],
     }
+    covariance = [0.0] * 36
+    covariance[0::7] = [1e-4, 4e-4, 9e-4, 1e-4, 1e-4, 4e-4]
+    pose = xyz(1.0, 2.0, 3.0), xyz(0.0, 0.0, 0.6, w=0.8)
+    data = json.loads(node.packet("bee", 7, stamp, *pose, covariance))
+    sigmas = data["position_sigma_m"] + data["rotation_sigma_rad"]
+    assert all(abs(a - b) < 1e-12 for a, b in zip(sigmas, [0.01, 0.02, 0.03, 0.02, 0.02, 0.02]))
+    for unknown in ([0.0] * 36, [-1.0] + [0.0] * 35):
+        assert "position_sigma_m" not in json.loads(node.packet("bee", 7, stamp, *pose, unknown))
     assert node.address("10.0.0.1:51002") == ("10.0.0.1", 51002)
+
+
+def test_invalid_ros_poses_are_marked():
+    node = load("ros2_pose")
+    stamp = Record(sec=12, nanosec=34)
+    for position, rotation in (
+        (xyz(math.nan, 2.0, 3.0), xyz(0.0, 0.0, 0.0, w=1.0)),
+        (xyz(1.0, 2.0, 3.0), xyz(0.0, 0.0, 0.0, w=0.0)),
+    ):
+        data = json.loads(node.packet("bee", 7, stamp, position, rotation))
+        assert (data["tracked"], data["rotation_xyzw"]) == (False, [0.0, 0.0, 0.0, 1.0])
 
 
 def run_node(monkeypatch, parameters, topic, message):
@@ -122,6 +141,13 @@ def test_a_crazyflie_s_quaternion_is_unpacked():
     data = json.loads(script.packet("bee", 3, 77, record))
     assert (data["position_m"], data["stamp_ns"]) == ([1.5, -0.02, 0.333], 77_000_000)
     assert abs(data["rotation_xyzw"][3] - 1) < 1e-9
+    variances = {"kalman.varPX": 1e-4, "kalman.varPY": 4e-4, "kalman.varPZ": 1e-4}
+    data = json.loads(script.packet("bee", 3, 77, record | variances))
+    assert data["tracked"] and [round(s, 6) for s in data["position_sigma_m"]] == [0.01, 0.02, 0.01]
+    assert len(data["rotation_sigma_rad"]) == 3
+    for lost in (1.0, -1.0, math.nan):
+        data = json.loads(script.packet("bee", 3, 77, record | variances | {"kalman.varPX": lost}))
+        assert not data["tracked"] and "position_sigma_m" not in data
 
 
 def test_the_ten_lines_of_the_guide_send_a_packet():
