@@ -9,7 +9,7 @@ use glam::DVec3;
 use vizflyt_bridge::bridge::COMPONENT_ID as BRIDGE;
 
 use super::plugin::Deed;
-use super::rig::{Place, Plan, Rig, Sight};
+use super::rig::{Capture, Place, Plan, Rig, Sight};
 use super::runtime::Settings;
 
 /// Lost program or link.
@@ -33,6 +33,8 @@ enum Loss {
     Bridge(f64),
     /// The motion capture sends no poses. [s]
     Poses(f64),
+    /// The motion capture sends something other than the vehicle's pose.
+    Capture(Capture),
     /// The server is killed.
     Server,
     /// The autopilot reboots.
@@ -204,10 +206,11 @@ const AT_ALL_SPEEDS: [Case; 16] = [
     },
 ];
 
+const HOLDS_AND_LANDS: &str = "runtime: holds after 0.15 s, LAND after 0.5 s";
 const BY_AUTOPILOT: &str = "autopilot: stops by GUID_TIMEOUT, LAND by FS_GCS_TIMEOUT";
 
 /// Losses at the lowest of [`SPEEDS_MPS`].
-const AT_ONE_SPEED: [Case; 7] = [
+const AT_ONE_SPEED: [Case; 10] = [
     Case {
         loss: Loss::Autopilot,
         name: "the autopilot reboots in flight",
@@ -263,6 +266,30 @@ const AT_ONE_SPEED: [Case; 7] = [
         bridge: true,
         by: By::Autopilot,
         land_within_s: 2.1,
+    },
+    Case {
+        loss: Loss::Capture(Capture::Repeats),
+        name: "the pose repeats",
+        does: HOLDS_AND_LANDS,
+        bridge: false,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.55,
+    },
+    Case {
+        loss: Loss::Capture(Capture::Origin),
+        name: "the pose is the origin: the vehicle is not visible",
+        does: HOLDS_AND_LANDS,
+        bridge: false,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.55,
+    },
+    Case {
+        loss: Loss::Capture(Capture::SecondSender),
+        name: "a second program sends poses of the vehicle",
+        does: HOLDS_AND_LANDS,
+        bridge: false,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.55,
     },
 ];
 
@@ -371,6 +398,7 @@ fn strike(rig: &mut Rig, case: &Case) -> f64 {
         Loss::Mavlink(_) => rig.wires.cut_mavlink(true),
         Loss::Bridge(_) => rig.kill_bridge(),
         Loss::Poses(_) => rig.wires.capture.is_cut = true,
+        Loss::Capture(capture) => rig.capture = capture,
         Loss::All => {
             rig.switch_off();
             rig.wires.capture.is_cut = true;

@@ -12,8 +12,9 @@
 
 use std::sync::Arc;
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use vizflyt_arena::{ArenaConfig, DistanceField};
+use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::mavlink::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
 use vizflyt_protocol::mavlink::{CopterMode, MAX_PACKET, MavHeader, encode};
 use vizflyt_protocol::messages::{Event, ImuReading, PoseSample};
@@ -56,8 +57,8 @@ pub(crate) fn server(now: HostTime) -> ServerTime {
 
 /// All links.
 pub(crate) struct Wires {
-    /// Motion capture to server.
-    pub(crate) capture: Wire<Vec<u8>>,
+    /// Motion capture to server: port of the sender, and packet.
+    pub(crate) capture: Wire<(u16, Vec<u8>)>,
     /// Server to runtime.
     pub(crate) poses: Wire<PoseSample>,
     /// Server to runtime.
@@ -109,6 +110,19 @@ impl Wires {
     pub(crate) fn cut_mavlink(&mut self, is_cut: bool) {
         (self.to_vehicle.is_cut, self.from_vehicle.is_cut) = (is_cut, is_cut);
     }
+}
+
+/// Packets of the motion capture.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) enum Capture {
+    #[default]
+    Usual,
+    /// The last pose again, in each frame.
+    Repeats,
+    /// The origin without rotation.
+    Origin,
+    /// A second program sends poses of the vehicle too.
+    SecondSender,
 }
 
 /// One pose of the motion capture.
@@ -206,6 +220,10 @@ pub(crate) enum Process {
     All,
 }
 
+/// Bytes of position and angles in a packet of Vicon, and of the last angle.
+const POSE: std::ops::Range<usize> = 32..80;
+const YAW: std::ops::Range<usize> = 72..80;
+
 /// A running flight.
 pub(crate) struct Rig {
     now: HostTime,
@@ -214,6 +232,9 @@ pub(crate) struct Rig {
     paused: Option<(Process, HostTime)>,
     simulation: Simulation,
     pub(crate) wires: Wires,
+    pub(crate) capture: Capture,
+    /// Last pose that the motion capture measured.
+    captured: Pose<World, Body>,
     server: Option<Server>,
     has_bridge: bool,
     bridge: Option<WifiBridge>,
@@ -240,6 +261,8 @@ impl Rig {
             paused: None,
             simulation: Simulation::new(config).expect("the autopilot has these parameters"),
             wires: Wires::new(seed),
+            capture: Capture::default(),
+            captured: Pose::new(DVec3::ZERO, DQuat::IDENTITY),
             server: Some(Server::new(now, &place.arena, Arc::clone(&place.obstacles))),
             has_bridge: bridge,
             bridge: bridge.then(|| WifiBridge::new(now)),
@@ -499,8 +522,19 @@ impl Rig {
         while let Some(sight) = self.simulation.poll_mocap() {
             let p_m = sight.world_from_body.translation_m;
             self.seen.track.push(Sight { at_s, p_m });
-            let packet = encode_object(sight.frame, OBJECT, &sight.world_from_body);
-            self.wires.capture.send(now, packet.to_vec());
+            if self.capture != Capture::Repeats {
+                self.captured = sight.world_from_body;
+            }
+            let mut packet = encode_object(sight.frame, OBJECT, &self.captured).to_vec();
+            if self.capture == Capture::Origin {
+                packet[POSE].fill(0);
+                // All zeros are Vicon's own mark of a hidden object; others do not mark it. A full turn is none.
+                packet[YAW].copy_from_slice(&std::f64::consts::TAU.to_le_bytes());
+            }
+            if self.capture == Capture::SecondSender {
+                self.wires.capture.send(now, (2, packet.clone()));
+            }
+            self.wires.capture.send(now, (1, packet));
         }
         let mode = self.simulation.autopilot().mode();
         if self.seen.modes.last().is_none_or(|&(_, last)| last != mode) {

@@ -74,8 +74,9 @@ impl Server {
         }
         let mut judged_at = None;
         // The kernel stamps packets when they arrive, also during a pause of the server.
-        while let Some((at, packet)) = wires.capture.receive_stamped(now) {
-            for measured in self.stream.handle_packet(server(at), &packet) {
+        while let Some((at, (port, packet))) = wires.capture.receive_stamped(now) {
+            let from = ([127, 0, 0, 1], port).into();
+            for measured in self.stream.handle_packet_from(server(at), from, &packet) {
                 if let Ok(sample) = self.referee.handle_measurement(&measured.with_covariance()) {
                     self.newest = Some(sample);
                     judged_at = Some(sample.stamp);
