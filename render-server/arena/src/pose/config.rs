@@ -31,7 +31,7 @@ pub struct PoseConfig {
     pub gate_sigmas: f64,
     /// Delay until a flipped attitude is accepted, if it persists. Swapped markers persist, so use more than
     /// `land_after_s`. [s]
-    pub flip_believed_after_s: f64,
+    pub flip_accept_delay_s: f64,
 }
 
 /// Instant for which an image is rendered.
@@ -61,7 +61,7 @@ impl Default for PoseConfig {
             stamp_sigma_s: 0.000_5,
             // With Gaussian noise, one good measurement in 3,000 exceeds this, in position or attitude.
             gate_sigmas: 4.5,
-            flip_believed_after_s: 1.0,
+            flip_accept_delay_s: 1.0,
         }
     }
 }
@@ -86,7 +86,7 @@ impl PoseConfig {
         check_number("pose.rotation_sigma_deg", self.rotation_sigma_deg, "degrees", 1e-3..=45.0)?;
         check_number("pose.stamp_sigma_s", self.stamp_sigma_s, "s", 0.0..=0.1)?;
         check_number("pose.gate_sigmas", self.gate_sigmas, "", 3.0..=100.0)?;
-        check_number("pose.flip_believed_after_s", self.flip_believed_after_s, "s", 0.0..=60.0)
+        check_number("pose.flip_accept_delay_s", self.flip_accept_delay_s, "s", 0.0..=60.0)
     }
 
     /// Whether every value is the default.

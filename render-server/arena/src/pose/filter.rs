@@ -335,7 +335,7 @@ impl PoseFilter {
             ClaimKind::Shift | ClaimKind::Leap if stays => {
                 GateResult::Reset { distance_m, angle_rad }
             }
-            ClaimKind::Flip if lasted_s >= self.config.flip_believed_after_s => {
+            ClaimKind::Flip if lasted_s >= self.config.flip_accept_delay_s => {
                 GateResult::Reset { distance_m, angle_rad }
             }
             ClaimKind::Flip => GateResult::Rejected(Rejected::Flip(angle_rad)),
