@@ -68,7 +68,7 @@ impl Event {
     }
 
     /// Kind of event: 'collision', 'geofence', 'stage', 'finished', 'time_limit', 'pose_lost', 'pose_regained',
-    /// 'emergency_stop', 'phase', 'plugin_failed', 'note', 'start' or 'land'.
+    /// 'emergency_stop', 'phase', 'ended', 'note', 'start' or 'land'. The documentation lists them in 'Events'.
     #[getter]
     fn kind(&self) -> &str {
         &self.kind

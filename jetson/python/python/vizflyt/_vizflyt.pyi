@@ -587,7 +587,7 @@ class Event:
     @property
     def kind(self) -> str:
         """Kind of event: 'collision', 'geofence', 'stage', 'finished', 'time_limit', 'pose_lost', 'pose_regained',
-        'emergency_stop', 'phase', 'plugin_failed', 'note', 'start' or 'land'.
+        'emergency_stop', 'phase', 'ended', 'note', 'start' or 'land'. The documentation lists them in 'Events'.
         """
 
     @property
