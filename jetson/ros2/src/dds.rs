@@ -67,7 +67,11 @@ impl Dds {
         if !interfaces.is_empty() {
             builder = builder.with_only_networks(interfaces.iter().copied());
         }
-        let failed = |error| anyhow!("cannot join DDS domain {domain}: {error:?}");
+        let failed = |error| {
+            anyhow!(
+                "cannot join DDS domain {domain}: {error:?}; check ROS_DOMAIN_ID and the network interface"
+            )
+        };
         let participant = builder.build().map_err(failed)?;
         let qos = QosPolicyBuilder::new().build();
         let publisher = participant.create_publisher(&qos).map_err(failed)?;

@@ -43,9 +43,13 @@ impl BridgeClient {
             if address.contains(':') { address.to_owned() } else { format!("{address}:14550") };
         let resolved = with_port
             .to_socket_addrs()
-            .with_context(|| format!("bridge: {address} has no address"))?
+            .with_context(|| {
+                format!("bridge: {address} has no address; give its IPv4 address, or NAME.local")
+            })?
             .find(SocketAddr::is_ipv4)
-            .with_context(|| format!("bridge: {address} has no IPv4 address"))?;
+            .with_context(|| {
+                format!("bridge: {address} has no IPv4 address; give its IPv4 address")
+            })?;
         let socket = UdpSocket::bind("0.0.0.0:0").context("bridge: cannot open a socket")?;
         socket.set_read_timeout(Some(Duration::from_millis(50)))?;
         let mut client = Self {
@@ -64,7 +68,10 @@ impl BridgeClient {
             hello.get(16..20).and_then(|bytes| bytes.try_into().ok()),
             hello.get(20),
         ) else {
-            bail!("bridge: {address} replied, but not with the bridge protocol");
+            bail!(
+                "bridge: {address} replied, but not with the bridge protocol; check the address, and update the older \
+                 of firmware and program"
+            );
         };
         client.random = *random;
         client.counter = u32::from_le_bytes(counter);

@@ -134,7 +134,10 @@ fn read_key(args: &ConfigureArgs) -> Result<Option<Key>> {
     let folder = KeysFolder::open(args.keys.as_deref())?;
     let Some(text) = folder.read_secret(KEY_FILE)? else { return Ok(None) };
     let key = key_from_hex(text.trim()).map_err(|_| {
-        anyhow::anyhow!("{}: not 64 hexadecimal digits", folder.file(KEY_FILE).display())
+        anyhow::anyhow!(
+            "{}: not 64 hexadecimal digits; copy the file again, or reset the bridge at its button and claim it",
+            folder.file(KEY_FILE).display()
+        )
     })?;
     Ok(Some(key))
 }

@@ -425,11 +425,19 @@ impl Show {
                     bail!("the {} ended before it was ready; see its message above", role.name())
                 }
                 Ok(Notice::Closed(from)) => {
-                    bail!("the {} ended while the {} started", from.name(), role.name())
+                    bail!(
+                        "the {} ended while the {} started; see its message above",
+                        from.name(),
+                        role.name()
+                    )
                 }
                 Ok(Notice::Interrupted) => return Ok(None),
                 Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {
-                    bail!("the {} was not ready within {} s", role.name(), READY_LIMIT.as_secs())
+                    bail!(
+                        "the {} was not ready within {} s; close other programs, or use a smaller scene",
+                        role.name(),
+                        READY_LIMIT.as_secs()
+                    )
                 }
             }
         }

@@ -39,7 +39,7 @@ pub(super) fn send<R: Read>(
         let _ = socket.send_to(packet.to_string().as_bytes(), to);
     }
     if seq == 0 {
-        bail!("the log contains no pose");
+        bail!("the log contains no pose; give the log of a flight with localization");
     }
     Ok(seq)
 }

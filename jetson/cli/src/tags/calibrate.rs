@@ -42,7 +42,7 @@ pub(super) struct CalibrateArgs {
 pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
     let stem = args.output.file_stem().and_then(|stem| stem.to_str());
     let Some(name) = args.name.as_deref().or(stem) else {
-        bail!("{}: the camera file needs a name", args.output.display());
+        bail!("{}: the camera file needs a name; give --name", args.output.display());
     };
     let model = if args.fisheye { LensModel::KannalaBrandt } else { LensModel::BrownConrady };
     let mut session = Session::new(Board::read(&args.board)?, model);

@@ -38,7 +38,7 @@ pub enum LogError {
     #[error(transparent)]
     Io(#[from] std::io::Error),
     /// The file does not begin as an MCAP file.
-    #[error("this is not an MCAP file: {0}")]
+    #[error("this is not an MCAP file: {0}; give a flight log, such as flights/DATE.mcap")]
     Foreign(mcap::McapError),
 }
 

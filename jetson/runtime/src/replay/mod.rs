@@ -62,7 +62,9 @@ pub enum ReplayError {
     #[error("the log has no images: none arrived in that flight, or its disk was full")]
     NoImages,
     /// The log has no start message of a plugin.
-    #[error("the log has no start message: the plugin never attached")]
+    #[error(
+        "the log has no start message: the plugin never attached; give the log of a flight whose plugin has started"
+    )]
     NoStart,
     /// The plugin's process cannot be started, or shared memory failed.
     #[error(transparent)]

@@ -342,7 +342,9 @@ impl Cell {
     /// Makes the cell once in a child process that exits at once.
     fn try_out(&self) -> Result<(), String> {
         if self.shown.len().max(self.covered.len()) > MAX_PLACES {
-            return Err(format!("there are more than {MAX_PLACES} folders to cover or to show"));
+            return Err(format!(
+                "there are more than {MAX_PLACES} folders to cover or to show; list fewer in read and write of [plugin]"
+            ));
         }
         let (reader, writer) = io::pipe().map_err(|error| error.to_string())?;
         let number = writer.as_raw_fd();

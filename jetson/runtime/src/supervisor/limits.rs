@@ -112,7 +112,8 @@ impl PluginLimits {
         let text = text.trim().to_owned();
         if text.len() > MAX_MAP {
             return Err(format!(
-                "the map of {} obstacles has {} kB, more than the maximum of {} kB",
+                "the map of {} obstacles has {} kB, more than the maximum of {} kB; merge obstacles, or leave \
+                 out distant ones",
                 volumes.len(),
                 text.len() / 1024,
                 MAX_MAP / 1024

@@ -32,7 +32,7 @@ pub fn decode(bytes: &[u8]) -> Result<Gray, String> {
     if bytes.starts_with(b"P5") {
         return pgm(bytes).ok_or_else(|| "damaged or not of 8 bits".into());
     }
-    Err("neither PNG, JPEG nor PGM".into())
+    Err("neither PNG, JPEG nor PGM; convert it to one of them".into())
 }
 
 fn png(bytes: &[u8]) -> Result<Gray, String> {

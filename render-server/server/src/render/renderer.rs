@@ -97,7 +97,7 @@ pub fn open_packed(
     loading: Loading,
 ) -> Result<CpuRenderer> {
     if kind == RendererKind::Gpu {
-        bail!("--renderer gpu: packed scenes are rendered by the processor");
+        bail!("--renderer gpu: packed scenes are rendered by the processor; choose cpu or auto");
     }
     let cannot = || format!("cannot use scene {}", path.display());
     let scene = PackedScene::open(path).with_context(cannot)?;

@@ -196,7 +196,11 @@ fn named(path: &Path) -> Result<Named> {
         if ["meta.json", "lod-meta.json"].iter().any(|name| path.join(name).is_file()) {
             return Ok(Named::Scene(path.to_owned()));
         }
-        bail!("{} is a folder without an arena.toml", path.display());
+        bail!(
+            "{} is a folder without an arena.toml; give the folder that contains it, or make one: \
+             vizflyt arena new DIR --scene FILE",
+            path.display()
+        );
     }
     let is_toml = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("toml"));
     Ok(if is_toml { Named::Arena(path.to_owned()) } else { Named::Scene(path.to_owned()) })

@@ -15,7 +15,7 @@ pub(crate) enum Refusal {
     #[error("the {0} header is missing or malformed; open the page itself, or send the header")]
     Missing(&'static str),
     /// The request comes from another page.
-    #[error("a page of '{origin}' may not act on '{host}'")]
+    #[error("a page of '{origin}' may not act on '{host}'; open the page at '{host}' itself")]
     Foreign {
         /// Origin of the page.
         origin: String,

@@ -33,7 +33,7 @@ impl Watchers {
                     ));
                 }
                 if self.teams.values().sum::<usize>() >= MAX_TEAMS {
-                    return Err(format!("{MAX_TEAMS} pages of teams are open already"));
+                    return Err(format!("{MAX_TEAMS} pages of teams are open already; close one"));
                 }
                 self.teams.insert(vehicle.clone(), own + 1);
                 Ok(())

@@ -32,7 +32,7 @@ pub enum LeaderboardError {
     #[error("cannot use the leaderboard {0}: {1}; was it made by a later version of this program?")]
     Migrate(Database, sqlx::migrate::MigrateError),
     /// The folder of the database file cannot be created.
-    #[error("cannot make the folder of the leaderboard {0}: {1}")]
+    #[error("cannot make the folder of the leaderboard {0}: {1}; give another with --leaderboard")]
     Folder(Database, std::io::Error),
     /// A query failed.
     #[error("the leaderboard {0} fails: {1}")]

@@ -121,13 +121,15 @@ pub enum JsonError {
         error: serde_json::Error,
     },
     /// Unsupported version.
-    #[error("vizflyt_pose is {0}, this server knows 1")]
+    #[error("vizflyt_pose is {0}, this server knows 1; send \"vizflyt_pose\": 1")]
     Version(u32),
     /// Position out of range.
-    #[error("position_m {0:?} is absurdly large")]
+    #[error("position_m {0:?} is absurdly large; send metres")]
     Position([f64; 3]),
     /// Quaternion without unit length.
-    #[error("rotation_xyzw {0:?} is not of unit length")]
+    #[error(
+        "rotation_xyzw {0:?} is not of unit length; send a unit quaternion in the order x, y, z, w"
+    )]
     Rotation([f64; 4]),
     /// Invalid sigmas.
     #[error("{key} {value:?}: give positive numbers")]

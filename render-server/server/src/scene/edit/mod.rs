@@ -118,7 +118,7 @@ impl Editor {
         let (mut splats, sha256) = read_with_hash(&self.original)?;
         ensure!(
             sha256 == self.list.scene.sha256,
-            "{} has been changed since it was opened",
+            "{} has been changed since it was opened; open it again",
             self.original.display()
         );
         for done in &self.list.steps[..last] {

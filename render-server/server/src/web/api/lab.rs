@@ -115,7 +115,9 @@ pub(in crate::web) async fn axes(
             return Err(format!("'{}' flies; land it first", vehicle.name));
         }
         let Some(source) = page.lab.source.clone() else {
-            return Err("this server has no source of poses".to_owned());
+            return Err(
+                "this server has no source of poses; add [[localization]] to arena.toml".to_owned()
+            );
         };
         let mut guided = lock(&page.lab.guided);
         *guided =

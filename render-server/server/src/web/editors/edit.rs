@@ -135,7 +135,7 @@ impl Session {
                 Ok((String::new(), true))
             }
             Order::Invert => {
-                ensure!(!self.regions.is_empty(), "nothing is selected");
+                ensure!(!self.regions.is_empty(), "nothing is selected; select splats first");
                 self.is_inverted ^= true;
                 Ok((String::new(), true))
             }
@@ -145,7 +145,7 @@ impl Session {
                 Ok((String::new(), had))
             }
             Order::Delete => {
-                ensure!(!self.regions.is_empty(), "nothing is selected");
+                ensure!(!self.regions.is_empty(), "nothing is selected; select splats first");
                 let within = self.regions.clone();
                 let step = if self.is_inverted {
                     EditStep::Crop { within }
@@ -169,7 +169,7 @@ impl Session {
                 Ok((format!("written: {}", self.output.display()), false))
             }
             Order::Name { name, class } => {
-                ensure!(!self.regions.is_empty(), "nothing is selected");
+                ensure!(!self.regions.is_empty(), "nothing is selected; select splats first");
                 let marks = self.selected();
                 let means =
                     self.editor.splats().means_m.iter().zip(marks).filter(|(_, mark)| *mark);

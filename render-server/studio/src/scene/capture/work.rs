@@ -259,7 +259,11 @@ impl Fingerprint {
             } else {
                 all.push(Self::of(&path)?);
             }
-            ensure!(all.len() <= MAX_FILES, "{} holds too many files", folder.display());
+            ensure!(
+                all.len() <= MAX_FILES,
+                "{} holds too many files; give a new folder to -o",
+                folder.display()
+            );
         }
         Ok(all)
     }
