@@ -17,6 +17,12 @@ SITE = pathlib.Path(__file__).resolve().parent
 ROOT = SITE.parents[1]
 REPOSITORY = "https://github.com/vizflyt/vizflyt"
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
+# A link labelled with a file's name: [safety.md](safety.md)
+LABEL = re.compile(r"\[([\w./-]+)\.md\]\(([^)\s#]+)")
+# Pages of the navigation, and their titles
+TITLE = re.compile(r"^ +- (.+): (\S+\.md)$", re.M)
+# Folders of the course that are not published: answers, and what `vizflyt new` writes
+PRIVATE = re.compile(r"^docs/course/\w+/(solution|starter)/")
 # The site's language of a code block has no attributes of rustdoc: ```rust,no_run
 ATTRIBUTES = re.compile(r"^(```\w+),[\w,]+$", re.M)
 CODE = re.compile(r"(^(?:```|~~~).*?^(?:```|~~~)[^\n]*$|`[^`\n]*`)", re.M | re.S)
@@ -30,21 +36,31 @@ The package `vizflyt`: `pip install` the wheel, or `pip install ./jetson/python`
 """
 
 
-def led(name: str, text: str) -> str:
-    """Returns a document with its links to files outside `docs` led to the repository."""
+def is_published(path: str) -> bool:
+    """Returns whether a file of the repository is part of the site."""
+    within = path.startswith("docs/") and not path.startswith("docs/site/") and not PRIVATE.match(path)
+    return within and (ROOT / path).is_file()
+
+
+def led(name: str, text: str, titles: dict[str, str]) -> str:
+    """Returns a document with its links to files outside the site led to the repository, and pages called by title."""
     folder = posixpath.dirname(name)
+
+    def call(match: re.Match[str]) -> str:
+        title = titles.get(posixpath.normpath(posixpath.join(folder, match[2])), match[1])
+        return f"[{title}]({match[2]}"
 
     def lead(match: re.Match[str]) -> str:
         begin, target, anchor, end = match.groups()
         path = posixpath.normpath(posixpath.join(folder, target))
-        if re.match(r"[a-z]+:", target) or (path.startswith("docs/") and (ROOT / path).is_file()):
+        if re.match(r"[a-z]+:", target) or is_published(path):
             return match[0]
         kind = "tree" if (ROOT / path).is_dir() else "blob"
         return f"{begin}{REPOSITORY}/{kind}/main/{path}{anchor or ''}{end}"
 
     # Odd parts are code.
     parts = CODE.split(text)
-    return "".join(part if index % 2 else LINK.sub(lead, part) for index, part in enumerate(parts))
+    return "".join(part if index % 2 else LINK.sub(lead, LABEL.sub(call, part)) for index, part in enumerate(parts))
 
 
 def subcommands(text: str) -> list[str]:
@@ -78,20 +94,21 @@ def main() -> None:
         ["git", "ls-files", "--cached", "--others", "--exclude-standard", "docs"],
         cwd=ROOT, check=True, capture_output=True, text=True,
     ).stdout.splitlines()
-    for name in listed:
+    config = (SITE / "mkdocs.yml").read_text()
+    titles = {f"docs/{path}": title for title, path in TITLE.findall(config)}
+    for name in filter(is_published, listed):
         source, target = ROOT / name, folder / name
-        if name.startswith("docs/site/") or not source.exists():
-            continue
         target.parent.mkdir(parents=True, exist_ok=True)
         if name.endswith(".md"):
-            target.write_text(led(name, ATTRIBUTES.sub(r"\1", source.read_text())))
+            target.write_text(led(name, ATTRIBUTES.sub(r"\1", source.read_text()), titles))
         else:
             shutil.copy(source, target)
     reference = folder / "docs/reference"
     reference.mkdir(exist_ok=True)
     (reference / "cli.md").write_text(commands(program))
     (reference / "python.md").write_text(PYTHON)
-    config = (SITE / "mkdocs.yml").read_text()
+    shutil.copytree(SITE / "theme", folder / "theme")
+    shutil.copy(SITE / "theme/site.css", folder / "docs")
     (folder / "mkdocs.yml").write_text(config.replace("PYTHON_PACKAGE", str(ROOT / "jetson/python/python")))
 
 
