@@ -132,6 +132,7 @@ fn content_type(path: &Path) -> &'static str {
         Some("svg") => "image/svg+xml",
         Some("png") => "image/png",
         Some("jpg") => "image/jpeg",
+        Some("webp") => "image/webp",
         Some("woff2") => "font/woff2",
         Some("md" | "py" | "rs" | "toml" | "txt") => "text/plain; charset=utf-8",
         _ => "application/octet-stream",
