@@ -1,6 +1,6 @@
 """Write a drone's autonomy in Python; fly it in a photorealistic world.
 
-A plugin is a class with the method ``on_image``::
+A plugin is a class with the method ``on_image``:
 
     import vizflyt
 

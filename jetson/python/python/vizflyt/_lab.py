@@ -27,8 +27,6 @@ _attached: Lab | None = None
 def attach(*, service: str | None = None, wait_s: float = 30.0) -> Lab:
     """Attaches to a lab that waits for a plugin (``vizflyt fly --attach``), and returns it on the ground, with images.
 
-    ::
-
         lab = vizflyt.attach()
         lab.take_off()
         obs = lab.fly(Setpoint.velocity([1, 0, 0], axes="heading"), seconds=2)

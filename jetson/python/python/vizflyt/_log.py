@@ -163,8 +163,6 @@ class _Found(NamedTuple):
 class Log:
     """A flight's log (MCAP), read from `path`.
 
-    ::
-
         log = vizflyt.Log("flight.mcap")
         for image in log.images("front"):
             pose = image.world_from_body                    # the image was rendered from it

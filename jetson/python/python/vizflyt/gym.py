@@ -1,7 +1,5 @@
 """Courses as reinforcement-learning environments: Gymnasium's API for many simulated vehicles on a virtual clock.
 
-::
-
     import gymnasium, vizflyt.gym                                          # needs Gymnasium
     env = gymnasium.make("vizflyt/Forest-v0")                              # the state
     envs = gymnasium.make_vec("vizflyt/Race-v0", num_envs=16, camera=(64, 48), observation=("state", "depth"))
