@@ -174,7 +174,7 @@ def table(figures: Figures) -> str:
         lines.append([f"{curve.panel}: {curve.name}", curve.over, " to ".join(f"{found[i][0]:,.0f}" for i in (0, -1)),
                       " to ".join(f"{found[i][1]:.3g}" for i in (0, -1)), f"{slope:.2f}{verdict}", f"{curve.most:g}"])
     grid = markdown(["what", "over", "from, to", "takes", "exponent of the last step", "at most"], lines)
-    return f"![What grows, over what there is](growth.svg)\n\n{grid}"
+    return f"![Time or memory of each computation against the size of its input](growth.svg)\n\n{grid}"
 
 
 def drawing(figures: Figures) -> str:
