@@ -9,8 +9,8 @@ import pathlib
 import re
 import sys
 
-# A fence, a row of a table, bold text or an image, as Markdown.
-RAW = re.compile(r"```|^\s*\|.*\||\*\*\w|!\[", re.M)
+# A fence, a row of a table, an item of a list (which needs an empty line before it), bold text or an image, as Markdown.
+RAW = re.compile(r"```|^\s*\|.*\||^(?:-|\d+\.) \S|\*\*\w|!\[", re.M)
 LOADS = {"img": "src", "script": "src", "source": "src", "iframe": "src", "link": "href"}
 
 
@@ -18,7 +18,8 @@ class Page(html.parser.HTMLParser):
     def __init__(self, path: pathlib.Path):
         super().__init__()
         self.path = path
-        self.depth_of_code = 0
+        self.is_paragraph = False
+        self.depth = 0
         self.headings = 0
         self.faults: list[str] = []
         self.feed(path.read_text())
@@ -27,7 +28,8 @@ class Page(html.parser.HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         given = dict(attrs)
-        self.depth_of_code += tag in ("code", "script", "style")
+        self.depth += tag in ("code", "strong")
+        self.is_paragraph |= tag == "p"
         self.headings += tag == "h1"
         address = given.get(LOADS.get(tag, "")) or ""
         is_loaded = tag != "link" or given.get("rel") in ("stylesheet", "icon", "preload")
@@ -41,10 +43,11 @@ class Page(html.parser.HTMLParser):
             self.faults.append("its link to the repository loads figures from there")
 
     def handle_endtag(self, tag: str) -> None:
-        self.depth_of_code -= tag in ("code", "script", "style")
+        self.depth -= tag in ("code", "strong")
+        self.is_paragraph &= tag != "p"
 
     def handle_data(self, data: str) -> None:
-        if not self.depth_of_code and (raw := RAW.search(data)):
+        if self.is_paragraph and not self.depth and (raw := RAW.search(data)):
             self.faults.append(f"Markdown that was not rendered: {data[raw.start():][:60]!r}")
 
 

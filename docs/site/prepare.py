@@ -26,6 +26,7 @@ PRIVATE = re.compile(r"^docs/course/\w+/(solution|starter)/")
 # The site's language of a code block has no attributes of rustdoc: ```rust,no_run
 ATTRIBUTES = re.compile(r"^(```\w+),[\w,]+$", re.M)
 CODE = re.compile(r"(^(?:```|~~~).*?^(?:```|~~~)[^\n]*$|`[^`\n]*`)", re.M | re.S)
+ITEM = re.compile(r"(?:-|\d+\.) +")
 PYTHON = """# Python API
 
 The package `vizflyt`: `pip install` the wheel, or `pip install ./jetson/python` from the sources.
@@ -61,6 +62,20 @@ def led(name: str, text: str, titles: dict[str, str]) -> str:
     # Odd parts are code.
     parts = CODE.split(text)
     return "".join(part if index % 2 else LINK.sub(lead, LABEL.sub(call, part)) for index, part in enumerate(parts))
+
+
+def indented(text: str) -> str:
+    """Returns a document with the content of list items indented by four columns: the site's Markdown needs them."""
+    lines, width, is_code = [], 0, False
+    for line in text.split("\n"):
+        if width and (not line or line.startswith(" " * width)):
+            lines.append(line and " " * 4 + line[width:])
+            continue
+        is_code ^= line.startswith(("```", "~~~"))
+        item = None if is_code else ITEM.match(line)
+        width = len(item[0]) if item else 0
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def subcommands(text: str) -> list[str]:
@@ -100,7 +115,7 @@ def main() -> None:
         source, target = ROOT / name, folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         if name.endswith(".md"):
-            target.write_text(led(name, ATTRIBUTES.sub(r"\1", source.read_text()), titles))
+            target.write_text(led(name, indented(ATTRIBUTES.sub(r"\1", source.read_text())), titles))
         else:
             shutil.copy(source, target)
     reference = folder / "docs/reference"
