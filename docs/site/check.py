@@ -9,7 +9,7 @@ import pathlib
 import re
 import sys
 
-# A fence, a row of a table, an item of a list (which needs an empty line before it), bold text or an image, as Markdown.
+# As Markdown: a fence, a row of a table, an item of a list without an empty line before it, bold text, an image.
 RAW = re.compile(r"```|^\s*\|.*\||^(?:-|\d+\.) \S|\*\*\w|!\[", re.M)
 LOADS = {"img": "src", "script": "src", "source": "src", "iframe": "src", "link": "href"}
 

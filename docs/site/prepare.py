@@ -115,7 +115,10 @@ def main() -> None:
         source, target = ROOT / name, folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         if name.endswith(".md"):
-            target.write_text(led(name, indented(ATTRIBUTES.sub(r"\1", source.read_text())), titles))
+            # Decisions are too many for the navigation.
+            index = "\n[All decisions](README.md)\n" if name.startswith("docs/decisions/0") else ""
+            text = indented(ATTRIBUTES.sub(r"\1", source.read_text())) + index
+            target.write_text(led(name, text, titles))
         else:
             shutil.copy(source, target)
     reference = folder / "docs/reference"
