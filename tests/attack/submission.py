@@ -38,11 +38,33 @@ def call(name, *arguments):
 
 
 def others():
-    return [p for p in os.listdir("/proc") if p.isdigit() and p not in ("1", str(os.getpid()))]
+    return [p for p in os.listdir("/proc") if p.isdigit() and p != str(os.getpid())]
 
 
-def command_lines():
-    return [line for p in others() if b"grade" in (line := pathlib.Path(f"/proc/{p}/cmdline").read_bytes())]
+def inside(name):
+    """Returns the content of the file, link or folder `name` of every process that is not this one, listed or not."""
+    found = []
+    for process in {*others(), *map(str, range(1, 64))} - {str(os.getpid())}:
+        path = pathlib.Path("/proc", process, name)
+        for look in (lambda path: path.read_bytes()[:4096], os.readlink, os.listdir):
+            try:
+                found.append((str(path), look(path)))
+            except OSError:
+                pass
+    return found
+
+
+def memory():
+    """Returns processes that are not this one and whose memory can be opened: reading at 0 fails for every process."""
+    return [process for process in range(1, 64) if process != os.getpid() and opens(f"/proc/{process}/mem")]
+
+
+def opens(path):
+    try:
+        os.close(os.open(path, os.O_RDONLY))
+    except OSError:
+        return False
+    return True
 
 
 def connect(family, address):
@@ -129,7 +151,9 @@ for path in TARGETS["secrets"]:
     attempt(f"read {path}", lambda path=path: pathlib.Path(path).read_bytes())
 if TARGETS["graded"]:
     attempt("environment", lambda: os.environ.get(TARGETS["variable"]))
-attempt("command line of the grader", command_lines)
+for name in ("cmdline", "environ", "maps", "auxv", "fd", "cwd", "root", "exe", "status"):
+    attempt(f"{name} of other processes", lambda name=name: inside(name))
+attempt("memory of other processes", memory)
 attempt("other processes", others)
 attempt("service of a user", lambda: connect(socket.AF_UNIX, TARGETS["service"]))
 attempt("network", lambda: connect(socket.AF_INET, ("127.0.0.1", TARGETS["port"])))

@@ -11,8 +11,8 @@
 //! runtime ── fork ──▶ keeper ── fork ──▶ init (PID 1 of the cell) ── fork ──▶ plugin
 //! ```
 //! The supervisor waits for the keeper, which ends with the plugin's exit status or signal. Init makes the mounts, and
-//! reaps the plugin's descendants. Both hold a copy of the runtime's memory, so they run no other program and cannot be
-//! inspected.
+//! reaps the plugin's descendants. Both hold a copy of the runtime's memory and command line, so they run no other program
+//! and cannot be inspected: they are not dumpable, and the cell's `/proc` shows only processes that the reader may trace.
 //!
 //! If the runtime is root, root makes the mounts and the plugin becomes another user. Otherwise a user namespace gives
 //! the necessary capabilities (user_namespaces(7)). The cell is made between fork and exec, where allocation is not
@@ -220,6 +220,9 @@ impl Cell {
             self.map_user()?;
             die_with_parent()?;
         }
+        // Before the plugin exists, so that it never sees a dumpable init. Its own exec makes it dumpable again.
+        // SAFETY: numbers only.
+        step("a hidden init", unsafe { libc::prctl(libc::PR_SET_DUMPABLE, 0, 0, 0, 0) })?;
         let plugin = fork()?;
         if plugin != 0 {
             reap(plugin, pipe[1]);
@@ -306,7 +309,10 @@ impl Cell {
             }
         }
         let hardened = libc::MS_NOSUID | libc::MS_NODEV | libc::MS_NOEXEC;
-        mount("a private /proc", Some(c"proc"), c"/proc", Some(c"proc"), hardened, None)?;
+        // Mode 4 hides processes that the reader may not trace, regardless of user and group. `cmdline` and `status` of
+        // init would otherwise be readable.
+        let options = Some(c"hidepid=4");
+        mount("a private /proc", Some(c"proc"), c"/proc", Some(c"proc"), hardened, options)?;
         self.folder.make_place()?;
         // SAFETY: a path that lives through the call. Leaves the working folder, which is outside the cell.
         step("its folder", unsafe { libc::chdir(self.folder.path.as_ptr()) })

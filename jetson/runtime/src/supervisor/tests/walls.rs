@@ -38,9 +38,30 @@ print(socket.gethostname() != '', os.listdir('/sys/class/net') and open('/proc/n
     );
     let (output, _) = python(&graded(), &program);
     let lines: Vec<&str> = output.lines().collect();
-    assert_eq!(&lines[..2], ["[1, 2]", "[] [] []"], "{output}");
+    assert_eq!(&lines[..2], ["[2]", "[] [] []"], "{output}");
     assert_eq!(lines[2], "True 1", "its only network is `lo`");
     drop(private);
+}
+
+/// PID 1 of a cell is a copy of the runtime, with its command line and memory.
+#[test]
+fn hides_the_files_of_init() {
+    if !has_cells() {
+        return;
+    }
+    let program = "
+import os
+for name in 'cmdline', 'environ', 'mem', 'maps', 'fd', 'cwd', 'root', 'exe', 'status', 'task/1/cmdline', 'net/dev':
+    for look in os.listdir, os.readlink, lambda path: os.open(path, os.O_RDONLY):
+        try:
+            print(name, look(f'/proc/1/{name}'))
+        except OSError:
+            pass
+print(os.access('/proc/1', os.F_OK), os.path.exists('/proc/2/cmdline'), os.path.exists('/proc/cpuinfo'))";
+    for limits in [graded(), PluginLimits::default()] {
+        let (output, _) = python(&limits, program);
+        assert_eq!(output, "False True True");
+    }
 }
 
 #[test]
