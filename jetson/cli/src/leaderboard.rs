@@ -274,9 +274,10 @@ fn entry(grade: &Grade, team: &str) -> Result<GradeEntry> {
         project: subject.project.clone(),
         level: subject.level.clone(),
         conditions: format!(
-            "{}, seeds {} to {last_seed}, {:.1}+{:.1} ms late, every {:.1} ms{}",
+            "{}, seeds {} to {last_seed}{}, {:.1}+{:.1} ms late, every {:.1} ms{}",
             subject.variants.join(" "),
             subject.first_seed,
+            subject.courses.as_ref().map_or(String::new(), |name| format!(" of {name}")),
             delays.image,
             delays.answer,
             delays.image_period,

@@ -11,6 +11,7 @@ use vizflyt_scenes::projects::{self, Level};
 use vizflyt_scenes::{Variant, VariantChoice};
 use vizflyt_simulator::imu::ImuModel;
 use vizflyt_studio::shard::Shard;
+use vizflyt_trust::{CourseSecret, KeyError};
 
 use super::judge;
 
@@ -33,7 +34,7 @@ use super::judge;
   vizflyt grade ./first --project p4 --report out --resume        resume an interrupted grade
   vizflyt grade ./first --project p4 --seeds 3 --watch            grade again when the plugin is saved
 
-The same plugin, program and seeds give the same hash on every run. Status 0 if all flights were flown,
+The same plugin, program, seeds and secret give the same hash on every run. Status 0 if all flights were flown,
 1 if --least was not reached.")]
 pub struct GradeArgs {
     #[command(subcommand)]
@@ -63,7 +64,7 @@ pub(super) struct FlyArgs {
     /// Timeout of an answer, in time of the plugin's own; a timeout is a failure
     #[arg(long, help_heading = "Plugin", value_name = "SECONDS", default_value_t = 10.0)]
     pub(super) answer_within: f64,
-    /// Path to hide from the plugin, like keys, seed and report; can be repeated
+    /// Path to hide from the plugin, like keys, seed, secret and report; can be repeated
     #[arg(long, help_heading = "Plugin", value_name = "PATH")]
     pub(super) hide: Vec<PathBuf>,
     /// Folder for the output of Cargo: `--watch` keeps it between its attempts
@@ -77,9 +78,15 @@ pub(super) struct FlyArgs {
     pub(super) seeds: u64,
     /// First seed, or a file that contains it
     ///
-    /// Keep it secret, so that teams cannot prepare for the courses.
+    /// Keep it secret, so that teams cannot prepare for the courses; --secret protects it from guesses.
     #[arg(long, help_heading = "Flight", value_name = "SEED|@FILE", default_value = "1")]
     pub(super) first_seed: FirstSeed,
+    /// File with the secret of the courses; created if missing
+    ///
+    /// Courses, noise and drift follow from its 128 random bits and the seed, so that a plugin cannot guess a course from
+    /// its noise. The same file repeats the same flights. Without it, the courses are public.
+    #[arg(long, help_heading = "Flight", value_name = "FILE")]
+    pub(super) secret: Option<PathBuf>,
     /// Fly only shard I of N; combine all shards with `grade merge`
     #[arg(long, help_heading = "Flight", value_name = "I/N")]
     pub(super) shard: Option<Shard>,
@@ -143,6 +150,21 @@ pub(super) struct FlyArgs {
 pub(super) struct FirstSeed {
     pub(super) value: u64,
     pub(super) file: Option<PathBuf>,
+}
+
+impl FlyArgs {
+    /// Reads the secret of the courses, or creates it.
+    ///
+    /// # Errors
+    /// If the file is not usable, or is missing on one of several computers.
+    pub(super) fn course_secret(&self) -> Result<CourseSecret, KeyError> {
+        match &self.secret {
+            None => Ok(CourseSecret::PUBLIC),
+            // All shards need the same file, so none of them creates it.
+            Some(path) if self.shard.is_some() => CourseSecret::read(path),
+            Some(path) => CourseSecret::read_or_create(path),
+        }
+    }
 }
 
 impl FromStr for FirstSeed {

@@ -45,7 +45,9 @@ pub(super) fn check(earlier: &Subject, now: &Subject) -> Result<()> {
         Ok(())
     };
     differs("project", &earlier.project, &now.project)?;
-    differs("level", &earlier.level, &now.level)
+    differs("level", &earlier.level, &now.level)?;
+    let courses = |subject: &Subject| subject.courses.clone().unwrap_or("public".to_owned());
+    differs("courses", &courses(earlier), &courses(now))
 }
 
 /// Returns the changes, one line each; empty if no flight was flown both times.

@@ -80,6 +80,9 @@ pub struct Subject {
     pub first_seed: u64,
     /// Number of seeds of each variant.
     pub seeds: u64,
+    /// Name of the secret of the courses, a hash that does not disclose it; absent if the courses are public.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub courses: Option<String>,
     /// Points table; absent if the project has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub points: Option<PointsTable>,
@@ -227,6 +230,14 @@ impl Subject {
         self.variants
             .iter()
             .flat_map(move |variant| seeds.clone().map(move |seed| (variant.as_str(), seed)))
+    }
+
+    /// Returns the courses as words.
+    pub fn courses(&self) -> String {
+        match &self.courses {
+            Some(name) => format!("secret, {name}"),
+            None => "public: they follow from the seed".to_owned(),
+        }
     }
 
     /// Returns the seeds of each variant.

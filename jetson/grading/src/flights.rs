@@ -19,7 +19,7 @@ use vizflyt_scenes::{Variant, VariantChoice};
 use vizflyt_simulator::imu::ImuModel;
 use vizflyt_splat::{CpuRenderer, Rasterizer, Splats};
 use vizflyt_studio::course::{CourseInstance, graded_name};
-use vizflyt_trust::hex;
+use vizflyt_trust::{CourseSecret, Purpose, hex};
 
 use super::args::FlyArgs;
 use super::document::{DelaysMs, Grade, MAX_SEEDS, Run, Subject};
@@ -38,20 +38,23 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let plugin = Plugin::find(typed)?;
     let project = CourseProject::find(&args.project)?;
     let (delays, imu) = (delays(args)?, args.imu);
-    let variants = variants(args, &project)?;
+    let secret = args.course_secret().context("--secret")?;
+    let variants = variants(args, &secret, &project)?;
     // Paths and memory that a plugin of the same user could read or forge: keys, and this process
     // (proc(5)).
     let keys = vizflyt_trust::KeysFolder::open(args.result.keys.as_deref())?;
     nix::sys::prctl::set_dumpable(false).context("cannot protect the memory of this process")?;
     let mut hide = vec![keys.file("")];
     hide.extend(args.first_seed.file.clone());
+    hide.extend(args.secret.clone());
     // The report may be in the plugin's own folder, and contains logs of finished flights.
     hide.extend(args.report.clone());
     hide.extend(args.hide.clone());
     let outputs = [&args.junit, &args.result.output].into_iter().flatten().cloned();
     let except: Vec<PathBuf> = hide.iter().cloned().chain(outputs).collect();
     let submission = Submission::read(&plugin, &except)?;
-    let subject = subject(args, &submission, &plugin, &project, &variants)?;
+    let mut subject = subject(args, &submission, &plugin, &project, &variants)?;
+    subject.courses = secret.name();
     let earlier = changes::earlier(args)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| args.since.is_some()) {
         changes::check(&earlier.subject, &subject)?;
@@ -78,8 +81,9 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
         }
         let named = || format!("seed {seed}, {variant}");
         let course =
-            CourseInstance::make(&project, args.level, variant, seed).with_context(named)?;
-        let course = &course;
+            CourseInstance::make(&project, args.level, variant, secret.seed(Purpose::Course, seed))
+                .with_context(named)?;
+        let (course, secret) = (&course, &secret);
         let reached = Cell::new(None);
         let attempt = || -> Result<Option<FlightDone>> {
             let images = report.as_ref().and_then(|report| Some((report, args.log.images()?)));
@@ -95,6 +99,7 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
             let (command, limits, reached) = (&copy.command[..], &limits, &reached);
             let trial = Trial {
                 course,
+                secret,
                 seed,
                 command,
                 limits,
@@ -227,14 +232,18 @@ fn delays(args: &FlyArgs) -> Result<Delays> {
 }
 
 /// Returns the variants to fly, including random ones.
-fn variants(args: &FlyArgs, project: &CourseProject) -> Result<Vec<Variant>> {
+fn variants(
+    args: &FlyArgs,
+    secret: &CourseSecret,
+    project: &CourseProject,
+) -> Result<Vec<Variant>> {
+    let seed = secret.seed(Purpose::Environments, args.first_seed.value);
     let mut variants: Vec<Variant> = Vec::new();
     for choice in &args.variants {
         let chosen: Vec<Variant> = match *choice {
             VariantChoice::Named(variant) => vec![variant],
             VariantChoice::Random(count) => {
-                let draw =
-                    |number| Variant::drawn(args.first_seed.value, number, project.environments());
+                let draw = |number| Variant::drawn(seed, number, project.environments());
                 (1..=count).map(draw).collect()
             }
         };
@@ -265,6 +274,7 @@ fn subject(
         environments: drawn.map(|drawn| (drawn.to_string(), drawn.environment())).collect(),
         first_seed: args.first_seed.value,
         seeds: args.seeds,
+        courses: None,
         points: project.points(args.level).copied(),
         delays: DelaysMs {
             image_period: tenth(1e3 / args.image_rate),

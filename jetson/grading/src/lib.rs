@@ -70,6 +70,7 @@ pub fn run(args: &GradeArgs) -> Result<ExitCode> {
                 grade.summary.finished,
                 grade.summary.runs
             ));
+            print_line(format!("courses     {}", grade.subject.courses()));
             match grade.files.len() {
                 0 => {}
                 count if is_folder => print_line(format!("all {count} files are as signed")),

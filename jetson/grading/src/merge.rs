@@ -17,6 +17,10 @@ pub fn merge(parts: &[(String, Grade)], key: &VerifyingKey) -> Result<Grade> {
     for (name, part) in parts {
         part.verify(key).with_context(|| format!("{name} is not valid"))?;
         ensure!(
+            part.subject.courses == first.subject.courses,
+            "{name} and {first_name} were flown on other courses: give every shard the same --secret FILE"
+        );
+        ensure!(
             part.subject == first.subject,
             "{name} and {first_name} are grades of different subjects: plugin, program, project, level, \
              variants, seeds, delays and renderer must be the same"
@@ -83,6 +87,8 @@ mod tests {
         refused(&[one.clone(), part(&subject, 2, 2, &[2, 5])], "every flight once");
         let other = Subject { plugin_sha256: "00".repeat(32), ..subject.clone() };
         refused(&[one.clone(), part(&other, 2, 2, &[2, 4])], "different subjects");
+        let other = Subject { courses: Some("77".repeat(16)), ..subject.clone() };
+        refused(&[one.clone(), part(&other, 2, 2, &[2, 4])], "the same --secret FILE");
         let mut forged = two.clone();
         forged.1.runs[0].score = 0.0;
         refused(&[one.clone(), forged], "part-2.json is not valid");

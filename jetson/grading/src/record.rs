@@ -32,6 +32,9 @@ pub struct FlownWith {
     /// Settings of random variants.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub environments: BTreeMap<String, EnvironmentConfig>,
+    /// Name of the secret of the courses; absent if they are public.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub courses: Option<String>,
     /// Time model.
     pub delays: DelaysMs,
     /// Simulated inertial sensor; absent if it is the default.
@@ -57,6 +60,7 @@ impl FlownWith {
             project: subject.project,
             level: subject.level,
             environments: subject.environments,
+            courses: subject.courses,
             delays: subject.delays,
             imu: subject.imu,
             program_sha256: subject.program_sha256,
@@ -76,6 +80,7 @@ impl FlownWith {
             ("project", self.project != there.project),
             ("level", self.level != there.level),
             ("drawn environments", self.environments != there.environments),
+            ("--secret", self.courses != there.courses),
             ("time model", self.delays != there.delays),
             ("--imu", self.imu != there.imu),
             ("program", self.program_sha256 != there.program_sha256),
@@ -205,6 +210,8 @@ mod tests {
         refused("{}", &sealing, &flown_with(), "not a record of a flight");
         let with = FlownWith { plugin_sha256: "00".repeat(32), ..flown_with() };
         refused(&text, &sealing, &with, "with another plugin: use another folder");
+        let with = FlownWith { courses: Some("77".repeat(16)), ..flown_with() };
+        refused(&text, &sealing, &with, "with another --secret: use another folder");
         let with = FlownWith { plugin: "race".into(), ..flown_with() };
         refused(&text, &sealing, &with, "with another plugin: use another folder");
         let with = FlownWith { project: "p5".into(), log: "full".into(), ..flown_with() };

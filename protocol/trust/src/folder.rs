@@ -75,6 +75,11 @@ impl KeysFolder {
         Ok(Self(path))
     }
 
+    /// Returns a folder that other users may enter, for files that are protected by their own mode.
+    pub(crate) fn shared(path: &Path) -> Self {
+        Self(path.to_owned())
+    }
+
     /// Returns the path of a file in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         self.0.join(name)

@@ -9,11 +9,13 @@
 //! tls          mutual TLS 1.3 with self-signed certificates; a client pins its server
 //! paired       paired.toml on the server: rights of each client
 //! servers      servers.toml on a client: known servers
+//! course_secret  secret of the courses of a grade
 //! pairing      SPAKE2 over a connection whose peers are not authenticated yet (sans-IO)
 //! ```
 //! This crate does not open sockets or read clocks. Only the fingerprint authorizes a client, after TLS has proved that
 //! the client holds the key.
 
+mod course_secret;
 pub mod fingerprint;
 pub mod folder;
 mod hex;
@@ -23,6 +25,7 @@ pub mod pairing;
 pub mod servers;
 pub mod tls;
 
+pub use course_secret::{CourseSecret, Purpose};
 pub use fingerprint::Fingerprint;
 pub use folder::{FileStamp, KeyError, KeysFolder};
 pub use hex::{from_hex, hex};

@@ -3,6 +3,7 @@
 //! ```text
 //! roster.csv ── team ─▶ SUBMISSIONS/team.zip, or a folder ─▶ DIR/plugins/team
 //!               ─▶ `vizflyt grade --resume` in a separate process
+//! DIR/course.secret: secret of the courses, the same for all teams and all runs
 //! DIR/reports/team: each report, signed      DIR/grades.csv: the roster with results      DIR/index.html
 //! ```
 //! The command can be interrupted and repeated at any time: grades of the same submission with the
@@ -15,15 +16,16 @@ mod submission;
 
 use std::ffi::{OsStr, OsString};
 use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitCode};
+use std::process::{Command, ExitCode, Stdio};
 
 use anyhow::{Context, Result, ensure};
 use clap::{Args, Parser};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use vizflyt_process::{print_fmt, print_line};
-use vizflyt_trust::hex;
+use vizflyt_trust::{CourseSecret, hex};
 
 use self::roster::{Roster, Team};
 pub use self::submission::{SubmitArgs, submit};
@@ -46,6 +48,11 @@ pub struct ClassArgs {
     /// Different courses for each team; seeds follow from the first seed and team name
     #[arg(long)]
     own_seeds: bool,
+    /// Courses that follow only from the seeds, so that everybody can fly them
+    ///
+    /// Without it, they follow from DIR/course.secret, 128 random bits. Delete that file to draw new courses.
+    #[arg(long)]
+    public_courses: bool,
     /// Roster of the class, one team per line
     #[arg(value_name = "ROSTER.csv")]
     roster: PathBuf,
@@ -72,6 +79,8 @@ struct Graded<'a> {
 struct Flown {
     submission_sha256: String,
     options: Vec<String>,
+    /// Name of the secret of the courses.
+    courses: Option<String>,
 }
 
 /// Runs `vizflyt grade-class`.
@@ -84,11 +93,17 @@ pub fn grade_class(args: &ClassArgs) -> Result<ExitCode> {
         args.submissions.display()
     );
     let program = std::env::current_exe().context("cannot find this program's path")?;
+    let secret = (!args.public_courses).then(|| args.output.join("course.secret"));
+    if let Some(path) = &secret {
+        fs::create_dir_all(&args.output)
+            .with_context(|| format!("cannot make {}", args.output.display()))?;
+        CourseSecret::read_or_create(path)?;
+    }
     let mut all = Vec::with_capacity(roster.teams.len());
     for (index, team) in roster.teams.iter().enumerate() {
         print_fmt!("{}/{} {}", index + 1, roster.teams.len(), team.name);
         let mut submission = String::new();
-        let result = grade_team(args, &program, team, &mut submission);
+        let result = grade_team(args, &program, team, secret.as_deref(), &mut submission);
         let result = result.map_err(|error| format!("{error:#}"));
         if let Err(why) = &result {
             print_fmt!("    no grade: {why}");
@@ -111,7 +126,7 @@ pub fn grade_class(args: &ClassArgs) -> Result<ExitCode> {
 fn check_options(options: &[OsString]) -> Result<()> {
     let ours = [
         "--report", "--resume", "--output", "-o", "--json", "--least", "--junit", "--shard",
-        "--hide",
+        "--hide", "--secret",
     ];
     for option in options {
         let text = option.to_string_lossy();
@@ -141,6 +156,7 @@ fn grade_team(
     args: &ClassArgs,
     program: &Path,
     team: &Team,
+    secret: Option<&Path>,
     submission: &mut String,
 ) -> Result<Grade> {
     let found = submission::find(&args.submissions, &team.name)?;
@@ -153,7 +169,11 @@ fn grade_team(
         submission_sha256: submission.clone(),
         // Options are stored as hashes, so that a secret seed is not stored.
         options: options.iter().map(|option| hash(option.as_encoded_bytes())).collect(),
+        courses: secret.map(CourseSecret::read).transpose()?.and_then(|secret| secret.name()),
     };
+    // On standard input: other users can see command lines.
+    let seed = if args.own_seeds { options.pop() } else { None };
+    options.extend(seed.is_some().then(|| "@/dev/stdin".into()));
     let [plugin, report, kept] =
         ["plugins", "reports", "state"].map(|folder| args.output.join(folder).join(&team.name));
     let kept = kept.with_extension("json");
@@ -178,14 +198,21 @@ fn grade_team(
         write(&kept, &serde_json::to_vec(&flown)?)?;
     }
     let hidden = hidden(args, &plugin)?;
-    let status = Command::new(program)
+    let mut grade = Command::new(program)
         .arg("grade")
         .arg(&plugin)
         .args(&options)
         .args([OsStr::new("--resume"), OsStr::new("--report"), report.as_os_str()])
         .args(hidden.iter().flat_map(|path| [OsStr::new("--hide"), path.as_os_str()]))
-        .status()
+        .args(secret.iter().flat_map(|path| [OsStr::new("--secret"), path.as_os_str()]))
+        .stdin(if seed.is_some() { Stdio::piped() } else { Stdio::inherit() })
+        .spawn()
         .context("cannot start vizflyt grade")?;
+    if let (Some(mut input), Some(seed)) = (grade.stdin.take(), &seed) {
+        // If the process has ended, its status is the error.
+        let _ = input.write_all(seed.as_encoded_bytes());
+    }
+    let status = grade.wait().context("cannot wait for vizflyt grade")?;
     ensure!(status.success(), "vizflyt grade ended with {status}; see its messages above");
     Grade::read(&grade_file)
 }
@@ -259,7 +286,7 @@ fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let folder = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(folder).with_context(cannot)?;
     let mut draft = tempfile::NamedTempFile::new_in(folder).with_context(cannot)?;
-    std::io::Write::write_all(&mut draft, bytes).with_context(cannot)?;
+    draft.write_all(bytes).with_context(cannot)?;
     draft.persist(path).with_context(cannot)?;
     Ok(())
 }

@@ -14,6 +14,7 @@ pub(crate) fn subject() -> Subject {
         first_seed: 1,
         points: None,
         seeds: 4,
+        courses: None,
         delays: DelaysMs { image_period: 33.3, image: 30.0, answer: 10.0 },
         imu: None,
         program: "0.1.0".into(),

@@ -33,6 +33,7 @@ use vizflyt_splat::sensor::SensorScene;
 use vizflyt_splat::weather::WeatherPass;
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Placement, Rasterizer, RgbdImage, Scene};
 use vizflyt_studio::evaluate::Stamped;
+use vizflyt_trust::Purpose;
 
 use super::kept::{Keyframes, Lines};
 use super::pending::{Pending, Picture};
@@ -119,7 +120,7 @@ impl<'a> Flight<'a> {
         let config = SimulationConfig {
             spawn_m: arena.spawn.position_m,
             spawn_yaw_rad: arena.spawn.yaw_deg.to_radians(),
-            seed: trial.seed,
+            seed: trial.seed(Purpose::Noise),
             body_radius_m: arena.body_radius_m,
             imu: trial.imu,
             // The hash of a flight contains every packet since the start.
@@ -131,7 +132,7 @@ impl<'a> Flight<'a> {
             ready_within_s: READY_WITHIN_S,
             time_limit_s: 0.0,
             limits: Limits::NONE,
-            slip_seed: trial.seed,
+            slip_seed: trial.seed(Purpose::Slip),
             cameras: Vec::new(),
         };
         let sensors = SensorSet::new(&arena.sensors).context("the course's sensors")?;
@@ -139,7 +140,7 @@ impl<'a> Flight<'a> {
         info.sensors = sensors.infos.iter().cloned().collect();
         let (splats, objects) = (&trial.course.splats, &trial.course.objects[..]);
         let scene = Scene { splats, objects };
-        let sensing = Sensing::of(sensors, scene, trial.seed);
+        let sensing = Sensing::of(sensors, scene, trial.seed(Purpose::Sensors));
         let renderer = CpuRenderer::new(scene);
         let mut hash = Sha256::new();
         hash.update(renderer.name().as_bytes());
@@ -328,7 +329,8 @@ impl<'a> Flight<'a> {
             .render(&placements, &cameras, images)
             .context("an image cannot be rendered")?;
         let weather = weather(&self.arena.environment);
-        let moment = exposure.moment(self.trial.seed);
+        let moment = exposure.moment(self.trial.seed(Purpose::Weather));
+        let imaging = self.trial.seed(Purpose::Imaging);
         let mut rendered: Vec<Option<Picture>> = self.cameras.iter().map(|_| None).collect();
         for ((&index, camera), image) in due.iter().zip(&cameras).zip(images) {
             let mut picture = Picture::default();
@@ -338,7 +340,7 @@ impl<'a> Flight<'a> {
             let width = info.intrinsics.width_px as usize;
             picture.ahead_m = ahead_m(&picture.depth_mm, width, &mut self.scratch);
             self.weather.apply(&weather, camera, &moment, image);
-            let seeds = [self.trial.seed, index as u64, self.seq + 1];
+            let seeds = [imaging, index as u64, self.seq + 1];
             let input = EffectInput { config, info, motion: &newest.motion, exposure, seeds };
             self.imaging[index].apply(&input, image);
             image.write_rgb8(&mut picture.rgb);

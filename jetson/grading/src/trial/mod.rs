@@ -36,6 +36,7 @@ use vizflyt_runtime::supervisor::PluginLimits;
 use vizflyt_simulator::imu::ImuModel;
 use vizflyt_studio::course::CourseInstance;
 use vizflyt_studio::evaluate::Stamped;
+use vizflyt_trust::{CourseSecret, Purpose};
 
 use self::flight::Flight;
 
@@ -54,7 +55,9 @@ pub(crate) struct Delays {
 /// Parameters of a graded flight.
 pub(crate) struct Trial<'a> {
     pub course: &'a CourseInstance,
-    /// Seed of the course and of the simulator's noise.
+    /// Secret from which course and noise follow, with the seed.
+    pub secret: &'a CourseSecret,
+    /// Seed of the flight.
     pub seed: u64,
     /// Command that starts the plugin.
     pub command: &'a [OsString],
@@ -161,6 +164,11 @@ impl TrialResult {
 }
 
 impl Trial<'_> {
+    /// Returns the seed for one purpose.
+    fn seed(&self, purpose: Purpose) -> u64 {
+        self.secret.seed(purpose, self.seed)
+    }
+
     /// Flies; returns `None` if stopped. The calling thread must live as long as the flight: the
     /// plugin dies with it.
     ///
@@ -182,5 +190,36 @@ impl Trial<'_> {
             log.finish().context("the flight's log cannot be written")?;
         }
         Ok(Some(flight.end()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+    use vizflyt_simulator::imu::{Imu, SensorSample};
+
+    use super::*;
+
+    /// Samples that a plugin receives before take-off.
+    fn at_rest(seed: u64) -> [SensorSample; 6] {
+        let mut imu = Imu::new(ImuModel::default(), seed);
+        [(); 6].map(|()| imu.sample(DVec3::Z * 9.81, DVec3::ZERO, 0.0, [0.0; 4], 0.0025))
+    }
+
+    #[test]
+    fn imu_noise_identifies_the_seed_only_of_public_courses() {
+        let folder = tempfile::tempdir().unwrap();
+        let secret = CourseSecret::read_or_create(&folder.path().join("secret")).unwrap();
+        // A plugin that tries all likely seeds.
+        let guess = |secret: &CourseSecret| {
+            let observed = at_rest(secret.seed(Purpose::Noise, 4711));
+            (0..10_000).find(|&seed| at_rest(seed) == observed)
+        };
+        assert_eq!(guess(&CourseSecret::PUBLIC), Some(4711));
+        assert_eq!(guess(&secret), None);
+        // The seed of the noise itself, if it were found, is of no use for the course.
+        let noise = secret.seed(Purpose::Noise, 4711);
+        let course = |seed| CourseSecret::PUBLIC.seed(Purpose::Course, seed);
+        assert_ne!(course(noise), secret.seed(Purpose::Course, 4711));
     }
 }
