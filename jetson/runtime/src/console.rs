@@ -148,7 +148,7 @@ impl Console {
 }
 
 /// Replaces control characters, so that a plugin cannot move the cursor or set the terminal's title.
-fn printable(text: &str) -> String {
+pub(crate) fn printable(text: &str) -> String {
     text.chars().map(|c| if c.is_control() && c != '\t' { '\u{fffd}' } else { c }).collect()
 }
 

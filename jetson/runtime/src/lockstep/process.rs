@@ -14,6 +14,7 @@ use vizflyt_sdk::ObservationTooLarge;
 use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd};
 
 use super::own_time::{OwnTime, look};
+use crate::console::printable;
 use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Stream, Supervisor};
 
 /// Maximum own time of a plugin for attaching and loading, because models load slowly.
@@ -109,7 +110,9 @@ impl PluginProcess {
         loop {
             match self.next(line)? {
                 Some(FromPlugin::Ready { .. }) => return Ok(()),
-                Some(FromPlugin::Failed { reason }) => return Err(failed(reason.as_str())),
+                Some(FromPlugin::Failed { reason }) => {
+                    return Err(failed(&printable(reason.as_str())));
+                }
                 Some(FromPlugin::Reply { .. } | FromPlugin::Odometry(_)) | None => {
                     if self.has_taken(&mut time, READY_WITHIN)? {
                         return Err(failed("`on_start` did not return within five minutes"));
@@ -172,6 +175,7 @@ impl PluginProcess {
                     return Ok(setpoint);
                 }
                 Some(FromPlugin::Failed { reason }) => {
+                    let reason = printable(reason.as_str());
                     return Err(failed(&format!("the plugin failed: {reason}")));
                 }
                 Some(FromPlugin::Odometry(odometry))

@@ -5,6 +5,8 @@ use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use crate::console::printable;
+
 /// Maximum length of a line; the rest is cut. [bytes]
 pub const LINE_BYTES: usize = 1024;
 /// Maximum rate of lines per stream; further lines are dropped and counted. A plugin that prints one
@@ -15,7 +17,8 @@ const TRACEBACK_LINES: usize = 200;
 /// Maximum number of calls in library code that are shown.
 const FOREIGN_CALLS: usize = 6;
 
-/// Reads lines to the end of the pipe, at most [`LINE_BYTES`] of each and [`LINES_PER_SECOND`].
+/// Reads lines to the end of the pipe, at most [`LINE_BYTES`] of each and [`LINES_PER_SECOND`], without control
+/// characters.
 pub(super) fn read_lines(pipe: impl Read, mut emit: impl FnMut(String)) {
     let mut reader = BufReader::new(pipe);
     let (mut window, mut passed, mut dropped) = (Instant::now(), 0, 0u64);
@@ -35,7 +38,7 @@ pub(super) fn read_lines(pipe: impl Read, mut emit: impl FnMut(String)) {
         }
         if passed < LINES_PER_SECOND {
             passed += 1;
-            emit(line);
+            emit(printable(line.trim_end_matches('\r')));
         } else {
             dropped += 1;
         }

@@ -293,3 +293,12 @@ fn runs_a_tool_to_its_end_or_its_timeout() {
     assert_eq!(error.kind(), io::ErrorKind::TimedOut, "{error}");
     until_gone("1000.25");
 }
+
+#[test]
+fn removes_control_characters_from_output() {
+    let (mut lines, _) =
+        to_the_end(&["sh", "-c", r"printf '\033[31mred\r\n'; printf '\033]0;x\007\n' >&2"]);
+    lines.sort_by_key(|(stream, _)| *stream != Stream::Stdout);
+    let lines: Vec<_> = lines.into_iter().map(|(_, line)| line).collect();
+    assert_eq!(lines, ["\u{fffd}[31mred", "\u{fffd}]0;x\u{fffd}"]);
+}
