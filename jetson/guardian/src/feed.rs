@@ -103,7 +103,7 @@ mod tests {
                 .get_or_insert_with(|| Subscription::new(&source).unwrap().expect("a source"));
             let now = || HostTime::from_ns(1_000_000_000 * (1 + number as u64));
             let _ = open.receive(now, &source);
-            server.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+            server.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
             let mut buffer = [0; MAX_FEED];
             let len = server.recv(&mut buffer).unwrap();
             let message = vizflyt_protocol::packet::feed::open(&key, &buffer[..len]);

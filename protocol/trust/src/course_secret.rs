@@ -108,7 +108,9 @@ impl CourseSecret {
     /// Returns the first `N` bytes of HMAC-SHA256 over the parts; `None` without a secret.
     fn keyed<const N: usize>(&self, parts: &[&[u8]]) -> Option<[u8; N]> {
         let mut mac = Hmac::<Sha256>::new_from_slice(&self.0?).ok()?;
-        parts.iter().for_each(|part| mac.update(part));
+        for part in parts {
+            mac.update(part);
+        }
         mac.finalize().into_bytes().first_chunk().copied()
     }
 }
