@@ -25,6 +25,7 @@ mod report;
 use std::ffi::OsString;
 use std::net::{SocketAddr, TcpListener};
 use std::os::unix::process::ExitStatusExt;
+use std::path::Path;
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
 
@@ -205,6 +206,14 @@ pub(crate) struct LabFlight<'a> {
     pub log_level: &'a str,
 }
 
+/// Returns a note if `scene` names a generated scene while `folder` has an arena of the same name.
+fn same_name_note(scene: &str, folder: &Path) -> Option<String> {
+    let kind: SceneKind = scene.parse().ok()?;
+    folder.join(scene).join("arena.toml").is_file().then(|| {
+        format!("generated; the folder of this name is not used: for it, give --scene ./{kind}")
+    })
+}
+
 /// Flies until the end; returns `None` if the user ends it first.
 ///
 /// # Errors
@@ -219,6 +228,12 @@ pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<LabReport>> {
     flight.lab.localization.check(stage.fence_m)?;
     if !flight.json {
         print_line(format!("scene       {scene}{}", stage.seeded(seed)));
+        if flight.lab.scene.is_some()
+            && flight.lab.project.is_none()
+            && let Some(note) = same_name_note(scene, Path::new(""))
+        {
+            print_line(format!("            {note}"));
+        }
         if let Some(project) = flight.lab.project() {
             let (level, variant) = (flight.lab.level(), flight.lab.variant());
             print_line(format!("project     {}: level {level}, {variant}", project.title()));
@@ -519,4 +534,20 @@ fn text(ready: &Value, key: &str) -> Result<String> {
         .as_str()
         .map(str::to_owned)
         .with_context(|| format!("the ready line {ready} has no '{key}'"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn notes_a_folder_that_a_generated_scene_hides() {
+        let folder = tempfile::tempdir().unwrap();
+        assert_eq!(same_name_note("forest", folder.path()), None);
+        std::fs::create_dir(folder.path().join("forest")).unwrap();
+        std::fs::write(folder.path().join("forest/arena.toml"), "").unwrap();
+        let note = same_name_note("forest", folder.path()).unwrap();
+        assert!(note.ends_with("give --scene ./forest"), "{note}");
+        assert_eq!(same_name_note("./forest", folder.path()), None);
+    }
 }

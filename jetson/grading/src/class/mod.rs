@@ -16,11 +16,11 @@ mod submission;
 
 use std::ffi::{OsStr, OsString};
 use std::fs;
-use std::io::Write;
+use std::io::{self, BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode, Stdio};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use clap::{Args, Parser};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -198,7 +198,7 @@ fn grade_team(
         write(&kept, &serde_json::to_vec(&flown)?)?;
     }
     let hidden = hidden(args, &plugin)?;
-    let mut grade = Command::new(program)
+    let mut child = Command::new(program)
         .arg("grade")
         .arg(&plugin)
         .args(&options)
@@ -206,16 +206,44 @@ fn grade_team(
         .args(hidden.iter().flat_map(|path| [OsStr::new("--hide"), path.as_os_str()]))
         .args(secret.iter().flat_map(|path| [OsStr::new("--secret"), path.as_os_str()]))
         .stdin(if seed.is_some() { Stdio::piped() } else { Stdio::inherit() })
+        .stderr(Stdio::piped())
         .spawn()
         .context("cannot start vizflyt grade")?;
-    if let (Some(mut input), Some(seed)) = (grade.stdin.take(), &seed) {
+    if let (Some(mut input), Some(seed)) = (child.stdin.take(), &seed) {
         // If the process has ended, its status is the error.
         let _ = input.write_all(seed.as_encoded_bytes());
     }
-    let status = grade.wait().context("cannot wait for vizflyt grade")?;
-    ensure!(status.success(), "vizflyt grade ended with {status}; see its messages above");
+    let mut error = String::new();
+    for line in BufReader::new(child.stderr.take().context("no standard error")?).split(b'\n') {
+        let line = String::from_utf8_lossy(&line?).into_owned();
+        // A closed terminal does not stop the grading.
+        let _ = writeln!(io::stderr(), "{line}");
+        note_error(&mut error, &line);
+    }
+    let status = child.wait().context("cannot wait for vizflyt grade")?;
+    if !status.success() && error.is_empty() {
+        bail!("vizflyt grade ended with {status}; see its messages above");
+    }
+    ensure!(status.success(), "{error}");
     Grade::read(&grade_file)
 }
+
+/// Adds a line of `vizflyt grade` to its last error message, which becomes one line without the carets
+/// of Python.
+fn note_error(error: &mut String, line: &str) {
+    if let Some(text) = line.strip_prefix("error: ") {
+        text.clone_into(error);
+    } else if !error.is_empty()
+        && error.len() < LONGEST_ERROR
+        && line.contains(|c| !matches!(c, '^' | '~' | ' '))
+    {
+        error.push(' ');
+        error.push_str(line.trim());
+    }
+}
+
+/// Length of an error message from which further lines are left out. [bytes]
+const LONGEST_ERROR: usize = 4096;
 
 /// Returns the grade of an earlier run, if its signature is valid. A grade without a signature is
 /// also returned; the table marks it.
@@ -294,6 +322,19 @@ fn write(path: &Path, bytes: &[u8]) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_teams_row_names_the_error_of_its_plugin() {
+        let messages = "a warning\nerror: plugin.py is not Python:\n  File \"plugin.py\", line 45\n    \
+                        def on_image(self, obs)\n          ^^\nSyntaxError: expected ':'\n";
+        let mut error = String::new();
+        messages.lines().for_each(|line| note_error(&mut error, line));
+        assert_eq!(
+            error,
+            "plugin.py is not Python: File \"plugin.py\", line 45 def on_image(self, obs) \
+             SyntaxError: expected ':'"
+        );
+    }
 
     #[test]
     fn a_teams_seeds_are_unique_and_follow_from_the_secret() {

@@ -14,7 +14,9 @@ pub(crate) mod submission;
 pub mod watch;
 
 use std::ffi::{OsStr, OsString};
+use std::fs;
 use std::io;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
@@ -262,8 +264,8 @@ fn check_python(python: &Path, script: &Path, copy: &Path, limits: &PluginLimits
     if let Some(user) = confinement.user_id().filter(|_| last.contains("PermissionError")) {
         bail!(
             "{last}: a plugin that root starts runs as another user (uid {user}), which must be able to read it; \
-             `chmod -R a+rX {}` lets everybody",
-            folder.display()
+             `{}` lets everybody, or start vizflyt as an ordinary user",
+            open_to_all(folder)
         );
     }
     let venv = folder.join(".venv");
@@ -277,6 +279,20 @@ fn check_python(python: &Path, script: &Path, copy: &Path, limits: &PluginLimits
         python.display(),
         venv = venv.display(),
     )
+}
+
+/// Returns the command after which every user can read `folder`: the folders above it must also let
+/// others through.
+fn open_to_all(folder: &Path) -> String {
+    let is_closed = |above: &&Path| {
+        fs::metadata(above).is_ok_and(|found| found.permissions().mode() & 0o001 == 0)
+    };
+    let mut closed: Vec<_> = folder.ancestors().skip(1).filter(is_closed).collect();
+    closed.reverse();
+    let mut steps: Vec<_> =
+        closed.iter().map(|above| format!("chmod a+x {}", above.display())).collect();
+    steps.push(format!("chmod -R a+rX {}", folder.display()));
+    steps.join(" && ")
 }
 
 /// Returns the folder of this program's sources with the SDK, if it still exists.
@@ -294,7 +310,6 @@ pub fn sources() -> Result<PathBuf> {
 
 #[cfg(test)]
 mod tests {
-    use std::fs;
     use std::os::unix::fs::PermissionsExt;
 
     use super::*;
@@ -363,6 +378,20 @@ mod tests {
             .unwrap_err()
             .to_string();
         assert!(error.contains("vizflyt.py hides the package"), "{error}");
+    }
+
+    #[test]
+    fn names_the_closed_folder_above_a_plugin() {
+        let above = tempfile::tempdir().unwrap();
+        let folder = above.path().join("first");
+        fs::create_dir(&folder).unwrap();
+        for (mode, opens) in [(0o700, true), (0o755, false)] {
+            fs::set_permissions(above.path(), fs::Permissions::from_mode(mode)).unwrap();
+            let command = open_to_all(&folder);
+            let first = format!("chmod a+x {} && ", above.path().display());
+            assert_eq!(command.contains(&first), opens, "{command}");
+            assert!(command.ends_with(&format!("chmod -R a+rX {}", folder.display())), "{command}");
+        }
     }
 
     #[test]

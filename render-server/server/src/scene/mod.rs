@@ -369,6 +369,24 @@ mod tests {
     }
 
     #[test]
+    fn a_predefined_model_needs_no_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = folder.path().join("arena.toml");
+        ply::write(folder.path().join("dot.ply"), &dot()).unwrap();
+        let arena = default_arena(&dot(), "dot.ply").unwrap().to_toml().unwrap();
+        for (file, expected) in [("models/gate-100x100.ply", 1), ("models/gat-1x1.ply", 0)] {
+            let object = "[[objects]]\nname = \"frame\"\nposition_m = [0.0, 0.0, 1.0]\nscene =";
+            std::fs::write(&at, format!("{arena}\n{object} \"{file}\"\n")).unwrap();
+            if expected == 0 {
+                check(&at, "or name a predefined model such as models/gate-120x100.ply");
+            } else {
+                let scene = load(&at, &BareArgs::default()).unwrap();
+                assert_eq!(scene.objects[0].splats, model(file).unwrap());
+            }
+        }
+    }
+
+    #[test]
     fn the_arena_overrides_the_files_anti_aliasing() {
         let folder = tempfile::tempdir().unwrap();
         // Our PLY files do not state it; the comment of brush does.

@@ -12,6 +12,8 @@ use vizflyt_arena::obstacles::Obstacles;
 use vizflyt_arena::{ArenaConfig, DistanceField, Ellipsoid, OccupancyGrid};
 use vizflyt_splat::{RigidObject, Splats};
 
+use super::models::model;
+
 /// Reads an arena's objects, numbered from 1 in its order. Paths are relative to the arena's folder.
 pub(super) fn read_all(
     arena: &ArenaConfig,
@@ -23,8 +25,13 @@ pub(super) fn read_all(
     let object = |(config, id): (&vizflyt_arena::config::ObjectConfig, u16)| {
         let path = folder.join(&config.scene);
         if !path.exists() {
+            // The name of a predefined model determines its splats, so its file is optional.
+            if let Some(splats) = model(&config.scene) {
+                return Ok(RigidObject { id, splats });
+            }
             bail!(
-                "the object '{}' of {} is in '{}', but there is no {}; correct its `scene`",
+                "the object '{}' of {} is in '{}', but there is no {}; correct its `scene`, or name a \
+                 predefined model such as models/gate-120x100.ply",
                 config.name,
                 arena_toml.display(),
                 config.scene,

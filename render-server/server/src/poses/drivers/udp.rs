@@ -111,10 +111,16 @@ impl UdpPort {
         self.address
     }
 
-    /// Connects the socket to a stream's parser.
+    /// Connects the socket to a stream's parser. Packets that came before are dropped: the kernel has not
+    /// stamped their arrival, so a sender that runs before the server would look like one whose clock jumps.
     pub fn with<S: PoseStream>(self, stream: S) -> UdpPoses<S> {
+        let arrivals = Arrivals::of(&self.socket);
+        if self.socket.set_nonblocking(true).is_ok() {
+            while self.socket.recv(&mut [0]).is_ok() {}
+            let _ = self.socket.set_nonblocking(false);
+        }
         UdpPoses {
-            arrivals: Arrivals::of(&self.socket),
+            arrivals,
             port: self,
             from: None,
             stream,
@@ -209,8 +215,31 @@ const FIRST_SILENCE_S: f64 = 5.0;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::poses::drivers::json::JsonStream;
     use crate::poses::drivers::vicon::ViconStream;
     use crate::poses::settings::LocalizationConfig;
+
+    #[test]
+    fn drops_packets_that_came_before_the_stream_was_read() {
+        let port = UdpPort::bind(Driver::Json, "127.0.0.1:0".parse().unwrap()).unwrap();
+        let to = port.address();
+        let sender = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let send = |x_m: u64| {
+            let packet = format!(
+                "{{\"vizflyt_pose\": 1, \"object\": \"v\", \"stamp_ns\": {}, \
+                 \"position_m\": [{x_m}, 0, 0], \"rotation_xyzw\": [0, 0, 0, 1]}}",
+                x_m * 20_000_000
+            );
+            sender.send_to(packet.as_bytes(), to).unwrap();
+        };
+        (1..50).for_each(send);
+        let config = LocalizationConfig::new(Driver::Json);
+        let mut source = port.with(JsonStream::new(&config, 0, &["v"]));
+        send(50);
+        let pose = source.receive(Duration::from_secs(30))[0];
+        assert_eq!(pose.world_from_body.translation_m.x, 50.0);
+        assert_eq!(source.next_warning(), None);
+    }
 
     #[test]
     fn reads_a_real_socket_and_warns_when_the_stream_ends() {
