@@ -71,6 +71,7 @@ def test_a_class_gets_its_grades_and_nobody_sees_the_others(desk, tmp_path):
     for team in ("red", "blue"):
         graded = json.loads((tmp_path / f"grades/reports/{team}/grade.json").read_text())
         (flight,) = graded["runs"]
+        assert graded["subject"]["team"] == team, graded["subject"]
         seeds.add(flight["seed"])
         seen = flight["reason"].split("sees ", 1)[1]
         if "signature" not in graded:

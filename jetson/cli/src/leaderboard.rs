@@ -265,6 +265,9 @@ fn entry(grade: &Grade, team: &str) -> Result<GradeEntry> {
     }
     ensure!(!grade.runs.is_empty(), "this grade has no flights");
     let (subject, summary) = (&grade.subject, &grade.summary);
+    if let Some(signed) = subject.team.as_ref().filter(|signed| *signed != team) {
+        anyhow::bail!("this grade is of team '{signed}', not of '{team}'; give --team {signed}");
+    }
     let last_seed = subject.first_seed.saturating_add(subject.seeds.saturating_sub(1));
     let delays = subject.delays;
     Ok(GradeEntry {

@@ -64,6 +64,9 @@ pub(super) struct FlyArgs {
     /// Timeout of an answer, in time of the plugin's own; a timeout is a failure
     #[arg(long, help_heading = "Plugin", value_name = "SECONDS", default_value_t = 10.0)]
     pub(super) answer_within: f64,
+    /// Name of the team, for the signed grade
+    #[arg(long, help_heading = "Plugin", value_name = "NAME")]
+    pub(super) team: Option<String>,
     /// Path to hide from the plugin, like keys, seed, secret and report; can be repeated
     #[arg(long, help_heading = "Plugin", value_name = "PATH")]
     pub(super) hide: Vec<PathBuf>,

@@ -44,6 +44,8 @@ pub(super) fn check(earlier: &Subject, now: &Subject) -> Result<()> {
         ensure!(earlier == now, "the earlier attempt is of {what} {earlier}, this one of {now}");
         Ok(())
     };
+    let team = |subject: &Subject| subject.team.clone().unwrap_or("no team".to_owned());
+    differs("team", &team(earlier), &team(now))?;
     differs("project", &earlier.project, &now.project)?;
     differs("level", &earlier.level, &now.level)?;
     let courses = |subject: &Subject| subject.courses.clone().unwrap_or("public".to_owned());
@@ -190,11 +192,14 @@ mod tests {
     }
 
     #[test]
-    fn rejects_another_course() {
+    fn rejects_another_course_or_team() {
         let p4 = subject();
         let p5 = Subject { project: "p5-other".into(), ..subject() };
         let error = check(&p4, &p5).unwrap_err().to_string();
         assert!(error.contains("of project") && error.contains("p5-other"), "{error}");
+        let red = Subject { team: Some("red".into()), ..subject() };
+        let error = check(&p4, &red).unwrap_err().to_string();
+        assert!(error.contains("of team no team, this one of red"), "{error}");
         assert!(check(&p4, &Subject { plugin_sha256: "00".into(), ..subject() }).is_ok());
     }
 }

@@ -67,6 +67,9 @@ pub struct Subject {
     pub plugin: String,
     /// SHA-256 over the plugin's files.
     pub plugin_sha256: String,
+    /// Name of the team that handed the plugin in; absent if it was not given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub team: Option<String>,
     /// Name of the project.
     pub project: String,
     /// Level of the sensors: `ug` or `g`.

@@ -268,6 +268,7 @@ fn subject(
     Ok(Subject {
         plugin: plugin.name().to_string_lossy().into_owned(),
         plugin_sha256: submission.sha256()?,
+        team: args.team.clone(),
         project: graded_name(project),
         level: args.level.to_string(),
         variants: variants.iter().map(Variant::to_string).collect(),

@@ -70,6 +70,9 @@ pub fn run(args: &GradeArgs) -> Result<ExitCode> {
                 grade.summary.finished,
                 grade.summary.runs
             ));
+            if let Some(team) = &grade.subject.team {
+                print_line(format!("team        {team}"));
+            }
             print_line(format!("courses     {}", grade.subject.courses()));
             match grade.files.len() {
                 0 => {}

@@ -22,8 +22,8 @@ pub fn merge(parts: &[(String, Grade)], key: &VerifyingKey) -> Result<Grade> {
         );
         ensure!(
             part.subject == first.subject,
-            "{name} and {first_name} are grades of different subjects: plugin, program, project, level, \
-             variants, seeds, delays and renderer must be the same"
+            "{name} and {first_name} are grades of different subjects: plugin, team, program, project, \
+             level, variants, seeds, delays and renderer must be the same"
         );
         let shard =
             part.shard.with_context(|| format!("{name} is a complete grade, not a shard"))?;

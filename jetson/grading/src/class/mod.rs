@@ -126,7 +126,7 @@ pub fn grade_class(args: &ClassArgs) -> Result<ExitCode> {
 fn check_options(options: &[OsString]) -> Result<()> {
     let ours = [
         "--report", "--resume", "--output", "-o", "--json", "--least", "--junit", "--shard",
-        "--hide", "--secret",
+        "--hide", "--secret", "--team",
     ];
     for option in options {
         let text = option.to_string_lossy();
@@ -182,7 +182,7 @@ fn grade_team(
         serde_json::from_slice(&bytes).ok().is_some_and(|old: Flown| old == flown)
     });
     if is_same && grade_file.is_file() {
-        match kept_grade(&grade_file, &options) {
+        match kept_grade(&grade_file, &team.name, &options) {
             Ok(grade) => return Ok(grade),
             Err(why) => print_fmt!("    graded again: {why:#}"),
         }
@@ -202,6 +202,7 @@ fn grade_team(
         .arg("grade")
         .arg(&plugin)
         .args(&options)
+        .args([OsStr::new("--team"), OsStr::new(&team.name)])
         .args([OsStr::new("--resume"), OsStr::new("--report"), report.as_os_str()])
         .args(hidden.iter().flat_map(|path| [OsStr::new("--hide"), path.as_os_str()]))
         .args(secret.iter().flat_map(|path| [OsStr::new("--secret"), path.as_os_str()]))
@@ -247,8 +248,9 @@ const LONGEST_ERROR: usize = 4096;
 
 /// Returns the grade of an earlier run, if its signature is valid. A grade without a signature is
 /// also returned; the table marks it.
-fn kept_grade(file: &Path, options: &[OsString]) -> Result<Grade> {
+fn kept_grade(file: &Path, team: &str, options: &[OsString]) -> Result<Grade> {
     let grade = Grade::read(file)?;
+    ensure!(grade.subject.team.as_deref() == Some(team), "{} is not of this team", file.display());
     if grade.signature.is_none() {
         return Ok(grade);
     }

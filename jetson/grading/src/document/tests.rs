@@ -7,6 +7,7 @@ pub(crate) fn subject() -> Subject {
     Subject {
         plugin: "avoid".into(),
         plugin_sha256: "11".repeat(32),
+        team: None,
         project: "forest".into(),
         level: "ug".into(),
         variants: vec!["day".into()],

@@ -219,6 +219,7 @@ fn origins(grade: &Grade) -> String {
     let delays = subject.delays;
     let rows = [
         ("Hash of all flights", grade.hash.clone()),
+        ("Team", subject.team.clone().unwrap_or_else(|| "not given".to_owned())),
         ("Courses", subject.courses()),
         ("Plugin", subject.plugin_sha256.clone()),
         ("Program", format!("{} {}", subject.program, subject.program_sha256)),
