@@ -147,9 +147,16 @@ impl Console {
     }
 }
 
-/// Replaces control characters, so that a plugin cannot move the cursor or set the terminal's title.
+/// Replaces control characters, so that a plugin cannot move the cursor or set the terminal's title. The ends of lines
+/// become spaces.
 pub(crate) fn printable(text: &str) -> String {
-    text.chars().map(|c| if c.is_control() && c != '\t' { '\u{fffd}' } else { c }).collect()
+    let shown = |c: char| match c {
+        '\t' => c,
+        '\n' => ' ',
+        _ if c.is_control() => '\u{fffd}',
+        _ => c,
+    };
+    text.chars().map(shown).collect()
 }
 
 /// A [`Console`] on standard output.
@@ -234,6 +241,11 @@ mod tests {
         assert_eq!(console.event("  the plugin flies"), expected);
         assert_eq!(console.end(), "\r\x1b[2K");
         assert_eq!(console.end(), "", "once");
+    }
+
+    #[test]
+    fn replaces_control_characters() {
+        assert_eq!(printable("a\x1b[31mb\nc\td"), "a\u{fffd}[31mb c\td");
     }
 
     #[test]

@@ -38,7 +38,7 @@ use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::host_now;
 
 use crate::companion::Companion;
-use crate::console::Screen;
+use crate::console::{Screen, printable};
 use crate::flight::{FlightSettings, Views};
 use crate::images::{Published, SharedSenses};
 use crate::link::{FenceEvent, LinkEvent, LinkSettings};
@@ -415,7 +415,7 @@ impl ControlLoop {
         match message {
             FromPlugin::Ready { .. } | FromPlugin::Reply { .. } if !counts => {}
             FromPlugin::Ready { name } => {
-                tracing::info!("plugin {name} is ready");
+                tracing::info!("plugin {} is ready", printable(&name));
                 self.companion.plugin_ready();
             }
             FromPlugin::Reply { seq, entered, returned, setpoint } => {
@@ -442,7 +442,7 @@ impl ControlLoop {
                 }
             }
             FromPlugin::Failed { reason } => {
-                self.plugin_failed(now, format!("the plugin failed: {reason}"));
+                self.plugin_failed(now, format!("the plugin failed: {}", printable(&reason)));
             }
         }
     }
