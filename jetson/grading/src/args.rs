@@ -67,7 +67,7 @@ pub(super) struct FlyArgs {
     /// Name of the team, for the signed grade
     #[arg(long, help_heading = "Plugin", value_name = "NAME")]
     pub(super) team: Option<String>,
-    /// Path to hide from the plugin, like keys, seed, secret and report; can be repeated
+    /// Path to hide from the plugin, like keys, secrets and report; can be repeated
     #[arg(long, help_heading = "Plugin", value_name = "PATH")]
     pub(super) hide: Vec<PathBuf>,
     /// Folder for the output of Cargo: `--watch` keeps it between its attempts

@@ -169,6 +169,8 @@ fn hear_autopilot(shared: &Shared) {
     let mut buffer = [0; MAX_MESSAGE - 1];
     let mut shared_at = None;
     while !shared.is_over.load(Ordering::Relaxed) {
+        let received = shared.port.receive(&mut buffer);
+        // Before the packet: a runtime that knows the autopilot can also reach it without this process.
         let changes = Some(shared.port.changes());
         if shared_at != changes {
             let sent = shared.port.share().and_then(|port| put_port(shared.runtime.as_fd(), &port));
@@ -177,7 +179,7 @@ fn hear_autopilot(shared: &Shared) {
         if let Some(intruder) = shared.port.poll_intruder() {
             let _ = put(shared.runtime.as_fd(), MessageKind::Note, intruder.to_string().as_bytes());
         }
-        match shared.port.receive(&mut buffer) {
+        match received {
             Ok(Some(len)) => {
                 // If the socket is full, telemetry is dropped, as on a network.
                 let _ = put(shared.runtime.as_fd(), MessageKind::Mavlink, &buffer[..len]);
