@@ -198,7 +198,8 @@ impl Guardian {
         let spare = self.spare.lock().unwrap_or_else(PoisonError::into_inner).take();
         let port = spare
             .ok_or(io::ErrorKind::NotConnected.into())
-            .and_then(|open| Port::adopt(&self.address, self.wanted.clone(), self.made_at, open));
+            .and_then(|open| Port::adopt(&self.address, self.wanted.clone(), self.made_at, open))
+            .or_else(|_| Port::open(&self.address, self.wanted.clone()));
         match port {
             Ok(port) => {
                 let _ = self.direct.set(port);

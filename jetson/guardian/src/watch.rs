@@ -185,8 +185,8 @@ impl Watch {
             }
         });
         if let Some((from, flight)) = beat {
-            // As in the runtime, the first autopilot keeps its place until it is silent.
-            let is_kept = now.seconds_since(self.autopilot_at) < LOST_AFTER_S;
+            // As in the runtime, the first autopilot keeps its place until it is silent; in flight, always.
+            let is_kept = self.flight.armed || now.seconds_since(self.autopilot_at) < LOST_AFTER_S;
             if self.autopilot.is_none_or(|known| known == from || !is_kept) {
                 (self.autopilot, self.autopilot_at, self.flight) = (Some(from), now, flight);
             }

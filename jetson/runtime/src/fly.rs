@@ -178,7 +178,7 @@ fn receive_mavlink(
                     let _ = sender.try_send(ControlInput::Note(text));
                 }
                 Ok(Some(Message::Failed(failure))) => {
-                    tracing::error!("{failure}: lands without it");
+                    tracing::error!("{failure}: the runtime lands the vehicle");
                     let _ = sender.send(ControlInput::GuardianFailed);
                 }
                 Ok(None) => {}

@@ -190,6 +190,8 @@ pub struct Link {
     commanded: Vec<(MavCmd, HostTime)>,
     /// `None` before the first heartbeat and after a timeout.
     autopilot: Option<Target>,
+    /// System of the vehicle that was armed on this link. No other vehicle takes its place, not even after a loss.
+    flown: Option<u8>,
     dialect: &'static dyn Dialect,
     firmware: Option<Firmware>,
     /// Whether the autopilot signs its packets.
@@ -253,6 +255,7 @@ impl Link {
             chores: VecDeque::new(),
             commanded: Vec::new(),
             autopilot: None,
+            flown: None,
             dialect: &dialect::ArduCopter,
             firmware: None,
             autopilot_signs: false,

@@ -129,7 +129,7 @@ impl Link {
             return;
         };
         let dialect = dialect::of(px4);
-        let ours = self.settings.system.is_none_or(|system| system == from.system);
+        let ours = self.settings.system.or(self.flown).is_none_or(|system| system == from.system);
         match self.autopilot {
             None if ours => {
                 self.autopilot = Some(from);
@@ -152,7 +152,9 @@ impl Link {
         let armed = heartbeat.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
         if armed != self.state.armed {
             self.state.armed = armed;
-            if !armed {
+            if armed {
+                self.flown = Some(from.system);
+            } else {
                 self.took_off = false;
             }
             self.events.push_back(if armed { LinkEvent::Armed } else { LinkEvent::Disarmed });

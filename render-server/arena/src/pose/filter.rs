@@ -150,18 +150,28 @@ impl PoseFilter {
         match self.sources[index].compare(measured) {
             Comparison::Equal(since_s) if self.in_flight => {
                 let repeated = Rejected::Repeated(since_s);
-                self.rejected = Some(repeated);
+                // A source may send each pose twice.
+                if since_s > REPEATS_S / 2.0 {
+                    self.rejected = Some(repeated);
+                }
                 return if since_s > REPEATS_S { Err(repeated) } else { Ok(None) };
             }
             // A source that sends old poses may begin with any of them.
             Comparison::Different(age_s)
-                if self.in_flight && age_s > REPEATS_S && self.is_lost(measured.stamp) =>
+                if self.in_flight
+                    && age_s > self.longest_interval_s(index, measured.stamp)
+                    && self.is_lost(measured.stamp) =>
             {
                 return Ok(None);
             }
             Comparison::Equal(_) | Comparison::Different(_) => {}
         }
         self.fuse(index, measured).map(Some)
+    }
+
+    /// Returns the maximum time between two poses of a source that has not repeated them. [s]
+    fn longest_interval_s(&self, index: usize, now: ServerTime) -> f64 {
+        REPEATS_S.max(1.6 / self.sources[index].rate_hz(now).max(1.0))
     }
 
     /// Fuses a measurement if it fits. Returns its innovation in standard deviations.

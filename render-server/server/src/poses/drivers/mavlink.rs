@@ -88,24 +88,26 @@ impl MavlinkStream {
         if !relevant || packet.header.component_id != AUTOPILOT {
             return;
         }
+        let (vehicle, address) = (self.vehicle_of(packet.header), from.unwrap_or(UNNAMED));
         if let MavMessage::HEARTBEAT(heartbeat) = &packet.message {
+            // A stranger must not stop the poses of the vehicle.
+            if vehicle.is_some_and(|vehicle| !self.names.may_be_sender(vehicle, address, now)) {
+                return;
+            }
             self.note_type(packet.header, heartbeat);
         }
         if self.refused.contains(&(packet.header.system_id as u8)) {
             return;
         }
-        let Some(vehicle) = self.vehicle_of(packet.header) else {
+        let Some(vehicle) = vehicle else {
             let name = packet.header.system_id.to_string();
             let advice =
                 "set `objects` to the autopilots' system numbers: objects = { bee = \"2\" }";
             return self.names.others(std::iter::once(name.as_str()), advice);
         };
-        if matches!(packet.message, MavMessage::HEARTBEAT(_)) {
-            let pinned = self.names.sender(vehicle);
-            if pinned.is_some_and(|pinned| from != Some(pinned)) {
-                return;
-            }
-        } else if !self.names.is_from_sender(vehicle, from.unwrap_or(UNNAMED), now) {
+        if !matches!(packet.message, MavMessage::HEARTBEAT(_))
+            && !self.names.is_from_sender(vehicle, address, now)
+        {
             return;
         }
         let system = &mut self.systems[vehicle];

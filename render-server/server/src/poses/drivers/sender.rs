@@ -35,9 +35,9 @@ pub(super) enum Heard {
 }
 
 impl Sender {
-    /// Returns the pinned address.
-    pub(super) fn pinned(&self) -> Option<SocketAddr> {
-        self.pinned.map(|(pinned, _)| pinned)
+    /// Whether a packet without a pose may be of the vehicle: no other address has sent poses of it lately.
+    pub(super) fn may_be(&self, from: SocketAddr, now: ServerTime) -> bool {
+        self.pinned.is_none_or(|(pinned, at)| pinned == from || now.seconds_since(at) > SILENT_S)
     }
 
     /// Processes a packet that arrived at `now`.

@@ -110,9 +110,9 @@ impl VehicleNames {
         &self.measured
     }
 
-    /// Returns the address to which the stream of a vehicle is pinned.
-    pub(super) fn sender(&self, vehicle: usize) -> Option<SocketAddr> {
-        self.objects[vehicle].sender.pinned()
+    /// Whether a packet without a pose may be of a vehicle: no other address has sent poses of it lately.
+    pub(super) fn may_be_sender(&self, vehicle: usize, from: SocketAddr, now: ServerTime) -> bool {
+        self.objects[vehicle].sender.may_be(from, now)
     }
 
     /// Processes the address of a packet with a pose of a vehicle. Returns whether the packet may be used: it is of

@@ -21,7 +21,7 @@ fn two_senders_are_reported_once_and_neither_is_used() {
         }
     }
     assert_eq!(reports, [(10, address(2))]);
-    assert_eq!(sender.pinned(), Some(address(1)));
+    assert!(sender.may_be(address(1), at(4000)) && !sender.may_be(address(2), at(4000)));
     // The second one stops.
     assert_eq!(sender.handle_packet(address(1), at(4200)), Heard::Conflict(None));
     assert_eq!(sender.handle_packet(address(1), at(4300)), Heard::Pinned);
