@@ -12,8 +12,7 @@ import math
 import socket
 import sys
 
-
-VARIANCES = ["kalman.varP" + axis for axis in "XYZ"]
+VARIANCES = ["kalman.var" + axis for axis in "XYZ"]
 # The Crazyflie logs no variance of its attitude.
 ROTATION_SIGMA_RAD = 0.02
 MAX_SIGMA_M = 0.5

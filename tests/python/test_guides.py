@@ -141,12 +141,12 @@ def test_a_crazyflie_s_quaternion_is_unpacked():
     data = json.loads(script.packet("bee", 3, 77, record))
     assert (data["position_m"], data["stamp_ns"]) == ([1.5, -0.02, 0.333], 77_000_000)
     assert abs(data["rotation_xyzw"][3] - 1) < 1e-9
-    variances = {"kalman.varPX": 1e-4, "kalman.varPY": 4e-4, "kalman.varPZ": 1e-4}
+    variances = {"kalman.varX": 1e-4, "kalman.varY": 4e-4, "kalman.varZ": 1e-4}
     data = json.loads(script.packet("bee", 3, 77, record | variances))
     assert data["tracked"] and [round(s, 6) for s in data["position_sigma_m"]] == [0.01, 0.02, 0.01]
     assert len(data["rotation_sigma_rad"]) == 3
     for lost in (1.0, -1.0, math.nan):
-        data = json.loads(script.packet("bee", 3, 77, record | variances | {"kalman.varPX": lost}))
+        data = json.loads(script.packet("bee", 3, 77, record | variances | {"kalman.varX": lost}))
         assert not data["tracked"] and "position_sigma_m" not in data
 
 
