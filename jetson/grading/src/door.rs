@@ -80,7 +80,12 @@ impl Door {
         let (mut folders, mut opened) = (vec![String::new()], 0);
         while let Some(prefix) = folders.pop() {
             opened += 1;
-            for (name, kind) in self.list(&prefix)? {
+            let listed = self.list(&prefix)?;
+            // A virtual environment of any name.
+            if listed.iter().any(|(name, _)| name == "pyvenv.cfg") {
+                continue;
+            }
+            for (name, kind) in listed {
                 let path = format!("{prefix}{name}");
                 let at = self.path.join(&path);
                 if is_left_out(&name) || kind == FileType::Directory && MADE.contains(&&*name) {
@@ -211,7 +216,8 @@ impl Door {
 
     fn too_many(&self, limit: &str) -> String {
         format!(
-            "{} contains more than {limit}; give the plugin a folder of its own",
+            "{} contains more than {limit}; move what the plugin does not need into a folder whose name starts with a \
+             dot",
             self.path.display()
         )
     }
@@ -221,7 +227,11 @@ const FOLDER: OFlags =
     OFlags::RDONLY.union(OFlags::DIRECTORY).union(OFlags::NOFOLLOW).union(OFlags::CLOEXEC);
 
 fn is_link(at: &Path) -> String {
-    format!("{} is a link or not a regular file; submit the file itself", at.display())
+    format!(
+        "{} is a link or not a regular file; replace it by the file, or move it into a folder whose name starts with a \
+         dot, which is left out",
+        at.display()
+    )
 }
 
 fn refused(error: Errno, at: &Path) -> anyhow::Error {
@@ -401,7 +411,7 @@ mod tests {
             assert!(error.contains(part), "{error}");
         };
         File::create(root.join("large")).unwrap().set_len(MOST_BYTES).unwrap();
-        refused("contains more than 209715200 bytes; give the plugin a folder of its own");
+        refused("contains more than 209715200 bytes; move");
         fs::remove_file(root.join("large")).unwrap();
         for number in 0..MOST_FILES {
             fs::create_dir(root.join(format!("empty{number}"))).unwrap();

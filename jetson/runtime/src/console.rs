@@ -149,7 +149,7 @@ impl Console {
 
 /// Replaces control characters, so that a plugin cannot move the cursor or set the terminal's title. The ends of lines
 /// become spaces.
-pub(crate) fn printable(text: &str) -> String {
+pub fn printable(text: &str) -> String {
     let shown = |c: char| match c {
         '\t' => c,
         '\n' => ' ',

@@ -25,6 +25,7 @@ use clap::{Args, Parser};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use vizflyt_process::{print_fmt, print_line};
+use vizflyt_runtime::console::printable;
 use vizflyt_trust::{CourseSecret, hex};
 
 use self::roster::{Roster, Team};
@@ -216,7 +217,7 @@ fn grade_team(
     }
     let mut error = String::new();
     for line in BufReader::new(child.stderr.take().context("no standard error")?).split(b'\n') {
-        let line = String::from_utf8_lossy(&line?).into_owned();
+        let line = printable(&String::from_utf8_lossy(&line?));
         // A closed terminal does not stop the grading.
         let _ = writeln!(io::stderr(), "{line}");
         note_error(&mut error, &line);
@@ -299,7 +300,8 @@ fn own_seed(options: &mut Vec<OsString>, team: &str) -> Result<()> {
     if let Some(path) = given.strip_prefix('@') {
         given = fs::read_to_string(path).with_context(|| format!("cannot read {path}"))?;
     }
-    let digest = Sha256::digest(format!("{}\0{team}", given.trim()));
+    let given: u64 = given.trim().parse().context("--first-seed is not a number")?;
+    let digest = Sha256::digest(format!("{given}\0{team}"));
     // 48 bits: JSON readers with floating-point numbers keep all following seeds exact.
     let seed = digest[..6].iter().fold(0, |seed: u64, byte| seed << 8 | u64::from(*byte));
     options.extend(["--first-seed".into(), seed.to_string().into()]);

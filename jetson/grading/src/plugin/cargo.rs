@@ -15,6 +15,8 @@ use std::{env, fs};
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use serde::Deserialize;
 use serde_json::Value;
+use vizflyt_process::print_error;
+use vizflyt_runtime::console::printable;
 use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
 
 use super::sources;
@@ -110,9 +112,16 @@ pub(super) fn build(
         .env("RUSTUP_HOME", home_of("RUSTUP_HOME", ".rustup"))
         .current_dir(&folder)
         .stdout(Stdio::piped());
+    if limits.graded {
+        // Student code must not hold the grader's terminal: it could read what is typed there.
+        cargo.stderr(Stdio::piped());
+    }
     let output = confinement
         .run(cargo, BUILD_WITHIN)
         .with_context(|| format!("{} cannot be built", folder.display()))?;
+    for line in String::from_utf8_lossy(&output.stderr).lines() {
+        print_error(printable(line));
+    }
     if !output.status.success() {
         bail!("{} does not build; see the compiler's message above", folder.display());
     }
@@ -148,6 +157,8 @@ fn metadata(folder: &Path) -> Result<Metadata> {
     cargo.arg(folder.join("Cargo.toml")).current_dir("/").stdin(Stdio::null());
     // Cargo would write a cache into the project's `target`, which may be a link.
     cargo.env("CARGO_CACHE_RUSTC_INFO", "0");
+    // A dependency must not be fetched with the keys of the grader.
+    cargo.env_remove("SSH_AUTH_SOCK");
     let output = cargo.stderr(Stdio::inherit()).output().with_context(|| {
         format!("cannot start cargo to build {}; rustup.rs installs it", folder.display())
     })?;
@@ -190,7 +201,11 @@ impl Metadata {
         let mut folders = Vec::new();
         for package in &self.packages {
             let folder = package.manifest_path.parent().unwrap_or(Path::new("/"));
-            let is_cloned = package.source.as_ref().is_some_and(|from| from.contains("file:"));
+            // A branch may change after the submission, and a repository may contain others of this computer.
+            let is_registry = |from: &String| {
+                from.starts_with("registry+https:") || from.starts_with("sparse+https:")
+            };
+            let is_cloned = package.source.as_ref().is_some_and(|from| !is_registry(from));
             let is_here = package.source.is_none() && !folder.starts_with(&self.workspace_root);
             let is_ours = ours.as_ref().is_some_and(|ours| folder.starts_with(ours));
             ensure!(

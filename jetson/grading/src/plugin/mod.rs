@@ -22,6 +22,7 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
+use vizflyt_runtime::console::printable;
 use vizflyt_runtime::supervisor::{Confinement, PluginLimits, is_python};
 
 use self::built_in::BuiltIn;
@@ -255,8 +256,8 @@ fn check_python(python: &Path, script: &Path, copy: &Path, limits: &PluginLimits
     if output.status.success() {
         return Ok(());
     }
-    let words = String::from_utf8_lossy(&output.stderr);
-    let words = words.replace(&*copy.to_string_lossy(), &script.to_string_lossy());
+    let words: Vec<_> = String::from_utf8_lossy(&output.stderr).lines().map(printable).collect();
+    let words = words.join("\n").replace(&*copy.to_string_lossy(), &script.to_string_lossy());
     if let Some(mistake) = words.strip_prefix("cannot be compiled\n") {
         bail!("{} is not Python:\n{}", script.display(), mistake.trim_end());
     }

@@ -155,13 +155,26 @@ impl OwnFiles {
         drop(Door::open(&outer)?.make(Path::new("build"))?);
         let project = cargo::ProjectCopy { root: &copy, target: &target };
         let program = cargo::build(&copy.join(&self.main), Some(&project), limits);
-        let program = program.with_context(|| format!("{}", self.root.display()))?;
+        let program = program.with_context(|| match outer_workspace(&self.root) {
+            Some(outer) => format!(
+                "{} belongs to the workspace {}, which is not copied; grade that folder, with \
+                 plugin = \"{}/Cargo.toml\" in its vizflyt.toml",
+                self.root.display(),
+                outer.display(),
+                self.root.strip_prefix(outer).unwrap_or(&self.root).display()
+            ),
+            None => format!("{}", self.root.display()),
+        })?;
         let folder = program.parent().unwrap_or(&target);
         let name = program.file_name().unwrap_or_default();
+        let mut left = door::MOST_BYTES;
         let mut read = |name: &OsStr| -> Result<()> {
             let inner = program.with_file_name(name);
             let inner = inner.strip_prefix(&target).context("the build's folder")?;
             let content = door::read_program(&target, inner)?;
+            left = left.checked_sub(content.len() as u64).context(
+                "its program and libraries are too large; build them without debug information",
+            )?;
             let path = self.main.join(BUILT).join(name);
             self.files.insert(path.to_string_lossy().into_owned(), content);
             Ok(())
@@ -200,6 +213,15 @@ impl GradedPlugin {
         limits.read.push(copy);
         Ok(FlightCopy { command, limits, _folder: Some(folder) })
     }
+}
+
+/// Returns the folder of the Cargo workspace around a folder, if there is one.
+fn outer_workspace(root: &Path) -> Option<&Path> {
+    let is_workspace = |folder: &&Path| {
+        let manifest = std::fs::read_to_string(folder.join("Cargo.toml")).unwrap_or_default();
+        manifest.lines().any(|line| line.trim() == "[workspace]")
+    };
+    root.ancestors().skip(1).find(is_workspace)
 }
 
 /// Whether files next to the plugin do not belong to it: in a home folder, and in the output of a build.
