@@ -19,14 +19,35 @@ STOP_WITHIN_S = 1.0
 PRESSES = 20
 
 
-class Unread:
-    """A running `vizflyt` whose standard output and standard error are one pipe, read only up to a line."""
+class Running:
+    """A running `vizflyt` with one descriptor as its standard output and standard error."""
+
+    def __init__(self, arguments, output):
+        self.process = subprocess.Popen([VIZFLYT, *map(str, arguments)], stdin=subprocess.PIPE, stdout=output,
+                                        stderr=output)
+
+    def end(self, within_s=20.0):
+        """Asks the program to end; returns whether it does, with the pipe still full."""
+        self.process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(within_s)
+            return True
+        self.process.kill()
+        self.process.wait()
+        return False
+
+
+class Unread(Running):
+    """As [`Running`], with a pipe that is read only up to a line."""
 
     def __init__(self, *arguments):
-        self.reader, self.writer = os.pipe()
-        self.process = subprocess.Popen([VIZFLYT, *map(str, arguments)], stdin=subprocess.PIPE, stdout=self.writer,
-                                        stderr=self.writer)
+        self.reader, self.writer = self.open()
+        super().__init__(arguments, self.writer)
         self.text = ""
+
+    @staticmethod
+    def open():
+        return os.pipe()
 
     def read_until(self, part, within_s=120.0):
         """Reads until `part` has been printed; returns its line."""
@@ -50,15 +71,6 @@ class Unread:
                 os.write(full, b"x" * 512)
         os.close(full)
 
-    def end(self, within_s=20.0):
-        """Asks the program to end; returns whether it does, with the pipe still full."""
-        self.process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(within_s)
-            return True
-        self.process.kill()
-        self.process.wait()
-        return False
 
 
 def press(page):
@@ -73,26 +85,21 @@ def press(page):
 class Terminal(Unread):
     """As [`Unread`], at a terminal whose reader stops reading."""
 
-    def __init__(self, *arguments):
-        self.reader, self.writer = os.openpty()
-        self.process = subprocess.Popen([VIZFLYT, *map(str, arguments)], stdin=subprocess.PIPE, stdout=self.writer,
-                                        stderr=self.writer)
-        self.text = ""
+    @staticmethod
+    def open():
+        return os.openpty()
 
     def fill(self):
         """Stops the terminal, as Ctrl-S does."""
         termios.tcflow(self.writer, termios.TCOOFF)
 
 
-class FullDisk:
-    """A running `vizflyt` whose standard output and standard error are files on a full disk."""
+class FullDisk(Running):
+    """As [`Running`], with a file on a full disk."""
 
     def __init__(self, *arguments):
         with open("/dev/full", "wb") as full:
-            self.process = subprocess.Popen([VIZFLYT, *map(str, arguments)], stdin=subprocess.PIPE, stdout=full,
-                                            stderr=full)
-
-    end = Unread.end
+            super().__init__(arguments, full)
 
 
 def serves(page, within_s=120.0):
@@ -142,7 +149,7 @@ def flying(folder, kind, how):
     report.unlink(missing_ok=True)
     demo = kind("demo", "--headless", "--max-rate=40", "--seconds=8", "--log=none", "--report", report)
     try:
-        if kind is not FullDisk:
+        if isinstance(demo, Unread):
             demo.read_until("the plugin flies")
             demo.fill()
         demo.process.wait(60)
@@ -158,9 +165,12 @@ def flying(folder, kind, how):
 with tempfile.TemporaryDirectory() as name:
     place = pathlib.Path(name)
     course = scene(place)
-    for output, how in ((Unread, "a full pipe"), (Terminal, "a stopped terminal")):
-        serving(place, course, output, how)
+    for unread, how in ((Unread, "a full pipe"), (Terminal, "a stopped terminal")):
+        serving(place, course, unread, how)
     serving_on_a_full_disk(place, course)
-    for output, how in ((Unread, "a full pipe"), (Terminal, "a stopped terminal"), (FullDisk, "a full disk")):
+    outputs: list[tuple[type[Running], str]] = [
+        (Unread, "a full pipe"), (Terminal, "a stopped terminal"), (FullDisk, "a full disk"),
+    ]
+    for output, how in outputs:
         flying(place, output, how)
 end()

@@ -13,12 +13,14 @@ import pytest
 SPY = '''
 import pathlib, sys
 here = pathlib.Path(__file__).resolve().parent
+# Each flight has a copy, in a folder with a random name.
+named = lambda path: "copy" if path.name.startswith("vizflyt-") else path.name
 found = []
 places = [here.parent, here.parents[1], here.parents[1] / "reports", here.parents[1] / "state"]
 for place in [*places, *map(pathlib.Path, {places})]:
     try:
         inside = place.iterdir() if place.is_dir() else [place]
-        found += [f"{inner.parent.name}/{inner.name}" for inner in inside if inner.exists()]
+        found += [f"{named(inner.parent)}/{named(inner)}" for inner in inside if inner.exists()]
     except OSError:
         pass
 raise SystemExit("sees " + ", ".join(sorted(found)))

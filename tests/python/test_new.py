@@ -1,19 +1,27 @@
 """A new student's first minutes: creates a plugin, tests it, flies it, saves it in flight, breaks it, replays it."""
 
 import json
+import shutil
 import subprocess
 import sys
+import sysconfig
+from pathlib import Path
 
 import pytest
 
 
 @pytest.fixture
 def first(program, tmp_path):
-    """Creates the plugin `first` in a new folder; it uses this process's environment."""
+    """Creates the plugin `first` in a new folder, with a virtual environment of this process's packages."""
     done = subprocess.run([program, "new", "first", "--lang", "python"], cwd=tmp_path)
     assert done.returncode == 0
     # As after `pip install -r requirements.txt`.
-    (tmp_path / "first/.venv").symlink_to(sys.prefix)
+    venv = tmp_path / "first/.venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", venv], check=True)
+    (site,) = venv.glob("lib/python3*/site-packages")
+    for package in Path(sysconfig.get_path("purelib")).iterdir():
+        if package.name.split("-")[0] in ("vizflyt", "numpy", "numpy.libs"):
+            shutil.copytree(package, site / package.name)
     return tmp_path / "first"
 
 
