@@ -200,7 +200,7 @@ STAGES = [
           f"cargo build --locked {FEATURED} --features {FEATURES} --bins"
           f" && jetson/python/build-wheel -o target/ros2/wheels --program {PROGRAM}"
           f" && tests/ros2/run {PROGRAM} target/ros2/wheels/*.whl", 130, [VENV],
-          ["jetson/ros2", "tests/ros2"]),
+          ["jetson/ros2", "protocol/process", "tests/ros2"]),
     Stage("leaderboard", "leaderboard on a PostgreSQL server", HEAVY, CLOCK,
           f"tests/leaderboard/run {FEATURES}", 5, [POSTGRES],
           ["render-server/server/src/flights/leaderboard", "tests/leaderboard"]),

@@ -12,6 +12,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
+use nix::sys::signal::{SigSet, SigmaskHow};
+
 /// Number of writes that a queue holds.
 const QUEUE: usize = 1024;
 /// Maximum time for which [`finish_output`] waits for each stream.
@@ -114,10 +116,15 @@ pub fn finish_output() {
 
 fn start(stream: OutputStream) -> Queue {
     let (sender, items) = sync_channel(QUEUE);
+    // Signals are for the other threads: a program that waits for them blocks them in its own threads only.
+    let before = SigSet::all().thread_swap_mask(SigmaskHow::SIG_BLOCK);
     std::thread::Builder::new()
         .name(format!("output-{stream:?}").to_lowercase())
         .spawn(move || drain(stream, &items))
         .expect("a thread starts");
+    if let Ok(before) = before {
+        let _ = before.thread_set_mask();
+    }
     Queue { sender, dropped: AtomicU64::new(0) }
 }
 
