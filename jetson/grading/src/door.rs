@@ -319,7 +319,16 @@ mod tests {
     #[test]
     fn copies_regular_files_only() {
         let (outer, root) = scene();
-        for name in [".git/config", "target/x", "venv/x", "a/__pycache__/p", "old.pyc", "f.mcap"] {
+        for name in [
+            ".git/config",
+            "target/x",
+            "venv/x",
+            "env/pyvenv.cfg",
+            "env/lib/x",
+            "a/__pycache__/p",
+            "old.pyc",
+            "f.mcap",
+        ] {
             fs::create_dir_all(root.join(name).parent().unwrap()).unwrap();
             fs::write(root.join(name), "").unwrap();
         }

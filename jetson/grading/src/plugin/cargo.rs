@@ -282,7 +282,11 @@ mod tests {
         }
         let solution = || package(None, "/home/x/solution/Cargo.toml");
         let cloned = package(Some("git+file:///home/x/solution"), "/home/x/.cargo/git/Cargo.toml");
-        for bad in [solution(), cloned] {
+        let branch = package(
+            Some("git+https://example.org/solution?branch=main"),
+            "/home/x/.cargo/git/checkouts/help/Cargo.toml",
+        );
+        for bad in [solution(), cloned, branch] {
             let error = of(bad).elsewhere(true).unwrap_err().to_string();
             assert!(
                 error.contains("is outside its folder") && error.contains("solution"),

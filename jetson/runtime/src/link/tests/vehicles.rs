@@ -112,3 +112,16 @@ fn a_flood_of_senders_hides_no_multirotor_and_prints_few_lines() {
     assert!(script.missing().contains("systems 1 and 250"), "{}", script.missing());
     assert!(named(&script).len() <= 16, "{}", named(&script).len());
 }
+
+#[test]
+fn no_other_vehicle_replaces_one_that_was_lost_in_flight() {
+    let mut script = Script::ready();
+    script.inject(&beat_of(MavType::MAV_TYPE_QUADROTOR));
+    assert!(script.link.state().armed);
+    script.run_silently(4.0);
+    assert!(!script.link.is_connected());
+    script.inject_from((9, 1), &beat_of(MavType::MAV_TYPE_QUADROTOR));
+    assert!(!script.link.is_connected(), "another team's vehicle must not get LAND");
+    script.inject(&beat_of(MavType::MAV_TYPE_QUADROTOR));
+    assert_eq!(script.link.system(), Some(1), "the flown one has returned");
+}

@@ -141,6 +141,27 @@ fn ignores_poses_of_other_vehicles() {
 }
 
 #[test]
+fn heartbeats_of_a_stranger_do_not_stop_the_poses() {
+    let mut s = stream("", &["v"]);
+    let [ours, stranger] =
+        ["10.0.0.1:14550", "10.0.0.2:14550"].map(|address| address.parse().unwrap());
+    let pose = |s: &mut MavlinkStream, ms: u32| {
+        let turn = DQuat::from_rotation_z(f64::from(ms) * 1e-3);
+        s.handle_packet_from(at(ms.into()), ours, &quaternion(1, ms, turn, 0.0));
+        s.handle_packet_from(at(ms.into()), ours, &position(1, ms, DVec3::X)).len()
+    };
+    assert_eq!(pose(&mut s, 10), 1);
+    let rover = packet(1, &beat(MavType::MAV_TYPE_GROUND_ROVER));
+    s.handle_packet_from(at(15), stranger, &rover);
+    assert_eq!((pose(&mut s, 20), s.next_warning()), (1, None));
+    assert_eq!(s.poll_transmit(at(21)).unwrap().0, ours);
+    // The autopilot's address has changed: its poses must be requested there.
+    let copter = packet(1, &beat(MavType::MAV_TYPE_QUADROTOR));
+    s.handle_packet_from(at(9000), stranger, &copter);
+    assert_eq!(s.poll_transmit(at(9001)).unwrap().0, stranger);
+}
+
+#[test]
 fn invalid_estimates_are_rejected() {
     let mut s = stream("", &["v"]);
     s.handle_packet(at(0), &quaternion(1, 10, DQuat::IDENTITY, 0.0));
