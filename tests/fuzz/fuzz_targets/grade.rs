@@ -34,6 +34,7 @@ fuzz_target!(|text: &str| {
         plugin_sha256: String::new(),
         project: String::new(),
         level: String::new(),
+        courses: None,
         environments: BTreeMap::new(),
         delays: DelaysMs { image_period: 33.3, image: 30.0, answer: 10.0 },
         imu: None,
