@@ -44,7 +44,7 @@ impl Subscription {
         if self.current.is_none_or(|known| known.key != feed.key) {
             // A new key means a new connection, perhaps to a restarted server, whose clock starts at zero.
             (self.newest, self.renew_at) = (ServerTime::ZERO, HostTime::ZERO);
-            // It may also be reached over the other version of IP.
+            // The new server may be reached over the other version of IP.
             if self.socket.local_addr().ok()?.is_ipv4() != feed.server.is_ipv4() {
                 let Ok(socket) = bind(feed.server) else {
                     thread::sleep(WAIT);

@@ -1,7 +1,7 @@
 //! Secret from which the courses of a grade follow, in addition to the seed.
 //!
 //! A seed number can be guessed: a plugin that observes noise at rest can try all likely numbers. With a secret, course,
-//! noise and all other random values are keyed hashes of the seed, each under a label of its own. One of them therefore
+//! noise and all other random values are keyed hashes of the seed, each with a separate label. One of them therefore
 //! discloses nothing about another.
 
 use core::fmt;

@@ -18,7 +18,7 @@ use crate::keys;
 
 /// Folders of the system. No student can write there, so their programs are not copied.
 const SYSTEM: [&str; 7] = ["/usr", "/bin", "/sbin", "/lib", "/opt", "/nix", "/gnu"];
-/// Where Cargo puts a program in its project.
+/// Folder of a built program, relative to its Cargo project.
 const BUILT: &str = "target/release";
 
 /// A plugin, and its files if they are a student's.

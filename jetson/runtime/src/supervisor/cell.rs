@@ -56,7 +56,7 @@ pub(super) struct Cell {
 #[derive(Clone, Debug)]
 struct Shown {
     path: CString,
-    /// The same file or folder by a path without links.
+    /// Path of this file or folder without links.
     source: CString,
     is_folder: bool,
     is_writable: bool,
